@@ -217,6 +217,11 @@ def options(cfg: Config, state: State, horizon: int) -> Tensor:
     return visible(turned, distance.unsqueeze(2))
 
 
+def summary(cfg: Config, reward: Tensor, info: dict[str, Tensor]) -> dict[str, Tensor]:
+    """An episode in percent: 100 x mean reward per step, 100 x mean coverage. (T, B) each -> (B,) each."""
+    return {"return": 100 * reward.mean(0), "coverage": 100 * info["coverage"].mean(0)}
+
+
 def wrap(degrees: Tensor) -> Tensor:
     """To [-180, 180)."""
     return torch.remainder(degrees + 180, 360) - 180

@@ -1,0 +1,107 @@
+"""What every learner shares: a replay of rows, and a network with its slow copy and optimiser."""
+
+from collections.abc import Callable
+from copy import deepcopy
+
+import torch
+from torch import Generator, Tensor, nn
+
+from rhmc.types import Batch, Obs, State
+
+Loss = Callable[..., tuple[Tensor, Batch]]
+
+
+class Replay:
+    """A ring of the newest `capacity` rows, kept on one device.
+
+    Args:
+        capacity: rows kept.
+        rng: generator for sampling; its device holds the rows.
+    """
+
+    def __init__(self, capacity: int, rng: Generator) -> None:
+        self.capacity, self.rng = capacity, rng
+        self.rows: Batch = {}
+        self.next = self.size = 0
+
+    def add(self, rows: Batch) -> None:
+        """Append rows: tensors with one leading dimension, the same keys and shapes at every call."""
+        count = len(next(iter(rows.values())))
+        if not self.rows:
+            self.rows = {k: v.new_zeros(self.capacity, *v.shape[1:]) for k, v in rows.items()}
+        index = torch.arange(self.next, self.next + count, device=self.rng.device) % self.capacity
+        for key, value in rows.items():
+            self.rows[key][index] = value
+        self.next = (self.next + count) % self.capacity
+        self.size = min(self.size + count, self.capacity)
+
+    def sample(self, count: int) -> Batch:
+        """`count` rows, uniformly and with replacement."""
+        index = torch.randint(self.size, (count,), generator=self.rng, device=self.rng.device)
+        return {key: value[index] for key, value in self.rows.items()}
+
+    def state_dict(self) -> State:
+        """The filled rows and the ring's position; the generator belongs to its owner."""
+        return {"rows": {k: v[: self.size] for k, v in self.rows.items()}, "next": self.next, "size": self.size}
+
+    def load_state_dict(self, state: State) -> None:
+        """Continue from `state_dict`."""
+        self.next, self.size = state["next"], state["size"]
+        self.rows = {}
+        for key, value in state["rows"].items():
+            self.rows[key] = value.new_zeros(self.capacity, *value.shape[1:], device=self.rng.device)
+            self.rows[key][: self.size] = value.to(self.rng.device)
+
+
+class Learner:
+    """A network, its slowly following copy and its optimiser. The loss is handed in at each update.
+
+    Args:
+        net: what learns.
+        lr: Adam's step size.
+        polyak: share of the slow copy kept per update (rho of Eq. 8 and 12).
+        clip: largest norm of the gradient.
+    """
+
+    def __init__(self, net: nn.Module, *, lr: float, polyak: float = 0.995, clip: float = 10.0) -> None:
+        self.net, self.slow = net, deepcopy(net).requires_grad_(False)
+        self.polyak, self.clip = polyak, clip
+        self.params, self.slow_params = list(net.parameters()), list(self.slow.parameters())
+        self.optimiser = torch.optim.Adam(self.params, lr=lr, fused=True)
+
+    def update(self, loss: Tensor) -> Tensor:
+        """One step down `loss`; returns the norm of the gradient. Other networks in the loss are left alone."""
+        grads = torch.autograd.grad(loss, self.params)
+        for param, grad in zip(self.params, grads, strict=True):
+            param.grad = grad
+        norm = nn.utils.clip_grad_norm_(self.params, self.clip, foreach=True)
+        self.optimiser.step()
+        with torch.no_grad():
+            torch._foreach_lerp_(self.slow_params, self.params, 1 - self.polyak)
+        return norm
+
+    def state_dict(self) -> State:
+        """Network, slow copy and optimiser."""
+        return {
+            "net": self.net.state_dict(),
+            "slow": self.slow.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+        }
+
+    def load_state_dict(self, state: State) -> None:
+        """Continue from `state_dict`."""
+        self.net.load_state_dict(state["net"])
+        self.slow.load_state_dict(state["slow"])
+        self.optimiser.load_state_dict(state["optimiser"])
+
+
+def pack(obs: Obs, prefix: str = "") -> Batch:
+    """An observation as rows of a replay (`first` is left out: networks do not see it)."""
+    return {f"{prefix}agents": obs.agents, f"{prefix}pairs": obs.pairs, f"{prefix}peers": obs.peers}
+
+
+def unpack(rows: Batch, prefix: str = "") -> Obs:
+    """The inverse of `pack`."""
+    pairs = rows[f"{prefix}pairs"]
+    first = torch.zeros(len(pairs), dtype=torch.bool, device=pairs.device)
+    return Obs(rows[f"{prefix}agents"], pairs, rows[f"{prefix}peers"], first)

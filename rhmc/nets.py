@@ -1,0 +1,203 @@
+"""Networks over an observation, in two encoders with the same three shapes.
+
+`local`: each agent from its own row. `central`: each agent from everything, with joint actions. `pairs`: each (agent,
+target) pair from everything. The encoder `mlp` is the paper's fully connected layer on padded, flattened features with
+a one-hot agent id; `pairwise` shares one network over all (agent, target) pairs and pools, so that its weights act for
+any N and M.
+"""
+
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from rhmc.types import Obs, Spec
+
+EncoderName = Literal["mlp", "pairwise"]
+
+
+class Sizes(NamedTuple):
+    """Feature counts of a network's input: an observation's own, plus what the algorithm appends to it."""
+
+    agents: int  # N
+    targets: int  # M
+    agent: int  # Fa
+    pair: int  # Fp
+    peer: int  # Fo
+
+    @classmethod
+    def of(cls, spec: Spec, *, agent: int = 0, pair: int = 0) -> "Sizes":
+        """The task's sizes, with `agent` and `pair` more features."""
+        return cls(
+            spec.agents, spec.targets, spec.agent_features + agent, spec.pair_features + pair, spec.peer_features
+        )
+
+
+def mlp(*sizes: int) -> nn.Sequential:
+    """Linear layers with ReLU between them; the last one is linear."""
+    layers: list[nn.Module] = []
+    for i, o in zip(sizes[:-1], sizes[1:], strict=True):
+        layers += [nn.Linear(i, o), nn.ReLU()]
+    return nn.Sequential(*layers[:-1])
+
+
+def append(obs: Obs, *, agent: Tensor | None = None, pair: Tensor | None = None) -> Obs:
+    """The observation with features (B, N, K) or (B, N, M, K) appended."""
+    agents = obs.agents if agent is None else torch.cat((obs.agents, agent), -1)
+    pairs = obs.pairs if pair is None else torch.cat((obs.pairs, pair), -1)
+    return obs._replace(agents=agents, pairs=pairs)
+
+
+class FlatLocal(nn.Module):
+    """Own row, flattened, and the agent's one-hot id -> (B, N, out)."""
+
+    def __init__(self, sizes: Sizes, hidden: int, out: int) -> None:
+        super().__init__()
+        self.net = mlp(_row(sizes) + sizes.agents, hidden, hidden, out)
+
+    def forward(self, obs: Obs) -> Tensor:
+        rows = _rows(obs)
+        return self.net(torch.cat((rows, _ids(rows)), -1))
+
+
+class FlatCentral(nn.Module):
+    """All rows, the joint action with the own part replaced, the own action and id -> (B, N, out)."""
+
+    def __init__(self, sizes: Sizes, hidden: int, out: int, actions: int = 0) -> None:
+        super().__init__()
+        n = sizes.agents
+        self.net = mlp(n * (_row(sizes) + actions) + actions + n, hidden, hidden, out)
+
+    def forward(self, obs: Obs, own: Tensor | None = None, joint: Tensor | None = None) -> Tensor:
+        rows = _rows(obs)
+        b, n, _ = rows.shape
+        parts = [rows.flatten(1).unsqueeze(1).expand(b, n, -1), _ids(rows)]
+        if own is not None and joint is not None:
+            others = joint.unsqueeze(1) * (1 - _ids(rows)).unsqueeze(-1)
+            parts += [others.flatten(2), own]
+        return self.net(torch.cat(parts, -1))
+
+
+class FlatPairs(nn.Module):
+    """All rows, flattened -> (B, N, M, out)."""
+
+    def __init__(self, sizes: Sizes, hidden: int, out: int) -> None:
+        super().__init__()
+        self.shape = (sizes.agents, sizes.targets, out)
+        self.net = mlp(sizes.agents * _row(sizes), hidden, hidden, sizes.agents * sizes.targets * out)
+
+    def forward(self, obs: Obs) -> Tensor:
+        return self.net(_rows(obs).flatten(1)).unflatten(1, self.shape)
+
+
+class _PairBody(nn.Module):
+    """One network on every pair -> embeddings (B, N, M, H)."""
+
+    def __init__(self, sizes: Sizes, hidden: int) -> None:
+        super().__init__()
+        self.pair = nn.Linear(sizes.pair, hidden)
+        self.agent = nn.Linear(sizes.agent, hidden, bias=False) if sizes.agent else None
+        self.second = nn.Linear(hidden, hidden)
+
+    def forward(self, obs: Obs) -> Tensor:
+        h = self.pair(obs.pairs)
+        if self.agent is not None:
+            h = h + self.agent(obs.agents).unsqueeze(2)
+        return self.second(h.relu_()).relu_()
+
+
+class _AgentBody(nn.Module):
+    """Pair embeddings pooled over targets, peers pooled over peers, own features -> (B, N, width)."""
+
+    def __init__(self, sizes: Sizes, hidden: int) -> None:
+        super().__init__()
+        self.pairs = _PairBody(sizes, hidden)
+        self.peers = mlp(sizes.peer, hidden, hidden) if sizes.peer else None
+        self.width = 2 * hidden + sizes.agent + (2 * hidden if sizes.peer else 0)
+
+    def forward(self, obs: Obs) -> Tensor:
+        parts = [_pool(self.pairs(obs), 2), obs.agents]
+        if self.peers is not None:
+            parts.append(_pool(self.peers(obs.peers).relu(), 2))
+        return torch.cat(parts, -1)
+
+
+class PairwiseLocal(nn.Module):
+    """Own pairs, pooled over targets -> (B, N, out)."""
+
+    def __init__(self, sizes: Sizes, hidden: int, out: int) -> None:
+        super().__init__()
+        self.body = _AgentBody(sizes, hidden)
+        self.head = mlp(self.body.width, hidden, out)
+
+    def forward(self, obs: Obs) -> Tensor:
+        return self.head(self.body(obs))
+
+
+class PairwiseCentral(nn.Module):
+    """Own embedding and action beside the mean of the other agents' -> (B, N, out)."""
+
+    def __init__(self, sizes: Sizes, hidden: int, out: int, actions: int = 0) -> None:
+        super().__init__()
+        self.body = _AgentBody(sizes, hidden)
+        self.other = nn.Linear(self.body.width + actions, hidden)
+        self.head = mlp(self.body.width + actions + hidden, hidden, out)
+
+    def forward(self, obs: Obs, own: Tensor | None = None, joint: Tensor | None = None) -> Tensor:
+        mine = theirs = self.body(obs)
+        if own is not None and joint is not None:
+            theirs = torch.cat((mine, joint), -1)
+            mine = torch.cat((mine, own), -1)
+        other = self.other(theirs).relu()
+        n = other.shape[1]
+        mean = (other.sum(1, keepdim=True) - other) / max(n - 1, 1)
+        return self.head(torch.cat((mine, mean), -1))
+
+
+class PairwisePairs(nn.Module):
+    """Each pair's embedding with its agent's pool and its target's pool -> (B, N, M, out)."""
+
+    def __init__(self, sizes: Sizes, hidden: int, out: int) -> None:
+        super().__init__()
+        self.pairs = _PairBody(sizes, hidden)
+        self.own = nn.Linear(hidden, hidden)
+        self.row = nn.Linear(2 * hidden, hidden, bias=False)
+        self.column = nn.Linear(2 * hidden, hidden, bias=False)
+        self.head = nn.Linear(hidden, out)
+
+    def forward(self, obs: Obs) -> Tensor:
+        e = self.pairs(obs)
+        context = self.row(_pool(e, 2)).unsqueeze(2) + self.column(_pool(e, 1)).unsqueeze(1)
+        return self.head((self.own(e) + context).relu_())
+
+
+class Encoder(NamedTuple):
+    """The three shapes of one encoder."""
+
+    local: Callable[..., nn.Module]
+    central: Callable[..., nn.Module]
+    pairs: Callable[..., nn.Module]
+
+
+ENCODERS: dict[str, Encoder] = {
+    "mlp": Encoder(FlatLocal, FlatCentral, FlatPairs),
+    "pairwise": Encoder(PairwiseLocal, PairwiseCentral, PairwisePairs),
+}
+
+
+def _pool(h: Tensor, dim: int) -> Tensor:
+    return torch.cat((h.mean(dim), h.amax(dim)), -1)
+
+
+def _row(sizes: Sizes) -> int:
+    return sizes.agent + sizes.targets * sizes.pair + sizes.agents * sizes.peer
+
+
+def _rows(obs: Obs) -> Tensor:
+    return torch.cat((obs.agents, obs.pairs.flatten(2), obs.peers.flatten(2)), -1)
+
+
+def _ids(rows: Tensor) -> Tensor:
+    b, n, _ = rows.shape
+    return torch.eye(n, device=rows.device).expand(b, n, n)

@@ -1,0 +1,56 @@
+"""Slow, readable twins of `rhmc.regulation`, on nested lists: options[i][d][j], assignment[i][j], one instance."""
+
+from itertools import product
+
+Options = list[list[list[bool]]]
+Assignment = list[list[bool]]
+
+
+def reward(completed: list[bool], assignment: Assignment, alpha: float) -> float:
+    """Eq. 6, term by term."""
+    total = 0.0
+    for j, done in enumerate(completed):
+        k = sum(row[j] for row in assignment)
+        if k == 0:
+            continue
+        p, q = int(done), int(not done)
+        total += p / k - alpha * q
+    return total
+
+
+def optimum(options: Options, assignment: Assignment, alpha: float) -> float:
+    """The best reward over every joint option."""
+    agents, targets = range(len(options)), range(len(assignment[0]))
+    return max(
+        reward(
+            [any(options[i][joint[i]][j] and assignment[i][j] for i in agents) for j in targets],
+            assignment,
+            alpha,
+        )
+        for joint in product(*(range(len(row)) for row in options))
+    )
+
+
+def algorithm1(options: Options, assignment: Assignment, alpha: float) -> float:
+    """Algorithm 1, line by line, on binary sequences held as integers."""
+    n, d, m = len(options), len(options[0]), len(assignment[0])
+
+    def act(i: int, j: int) -> int:
+        return sum(2**t for t in range(m) if options[i][j][t] and assignment[i][t])
+
+    def cnt(mask: int) -> int:
+        return bin(mask).count("1")
+
+    dp = [[0] * d for _ in range(n)]
+    for i in range(n):
+        for j in range(d):
+            mask = act(i, j)
+            for k in range(d):
+                if i == 0:
+                    dp[i][j] = mask
+                elif cnt(dp[i][j]) < cnt(dp[i - 1][k] | mask):
+                    dp[i][j] = dp[i - 1][k] | mask
+    best = float("-inf")
+    for j in range(d):
+        best = max(best, reward([bool(dp[n - 1][j] >> t & 1) for t in range(m)], assignment, alpha))
+    return best
