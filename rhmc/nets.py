@@ -62,20 +62,21 @@ class FlatLocal(nn.Module):
 
 
 class FlatCentral(nn.Module):
-    """All rows, the joint action with the own part replaced, the own action and id -> (B, N, out)."""
+    """All rows, the other agents' actions (B, N, joint), the own action (B, N, own) and id -> (B, N, out)."""
 
-    def __init__(self, sizes: Sizes, hidden: int, out: int, actions: int = 0) -> None:
+    def __init__(self, sizes: Sizes, hidden: int, out: int, *, own: int = 0, joint: int = 0) -> None:
         super().__init__()
         n = sizes.agents
-        self.net = mlp(n * (_row(sizes) + actions) + actions + n, hidden, hidden, out)
+        self.net = mlp(n * (_row(sizes) + joint) + own + n, hidden, hidden, out)
 
     def forward(self, obs: Obs, own: Tensor | None = None, joint: Tensor | None = None) -> Tensor:
         rows = _rows(obs)
         b, n, _ = rows.shape
         parts = [rows.flatten(1).unsqueeze(1).expand(b, n, -1), _ids(rows)]
-        if own is not None and joint is not None:
-            others = joint.unsqueeze(1) * (1 - _ids(rows)).unsqueeze(-1)
-            parts += [others.flatten(2), own]
+        if joint is not None:
+            parts.append((joint.unsqueeze(1) * (1 - _ids(rows)).unsqueeze(-1)).flatten(2))
+        if own is not None:
+            parts.append(own)
         return self.net(torch.cat(parts, -1))
 
 
@@ -136,18 +137,19 @@ class PairwiseLocal(nn.Module):
 
 
 class PairwiseCentral(nn.Module):
-    """Own embedding and action beside the mean of the other agents' -> (B, N, out)."""
+    """Own embedding and action (B, N, own) beside the mean of the others' with theirs (B, N, joint) -> (B, N, out)."""
 
-    def __init__(self, sizes: Sizes, hidden: int, out: int, actions: int = 0) -> None:
+    def __init__(self, sizes: Sizes, hidden: int, out: int, *, own: int = 0, joint: int = 0) -> None:
         super().__init__()
         self.body = _AgentBody(sizes, hidden)
-        self.other = nn.Linear(self.body.width + actions, hidden)
-        self.head = mlp(self.body.width + actions + hidden, hidden, out)
+        self.other = nn.Linear(self.body.width + joint, hidden)
+        self.head = mlp(self.body.width + own + hidden, hidden, out)
 
     def forward(self, obs: Obs, own: Tensor | None = None, joint: Tensor | None = None) -> Tensor:
         mine = theirs = self.body(obs)
-        if own is not None and joint is not None:
-            theirs = torch.cat((mine, joint), -1)
+        if joint is not None:
+            theirs = torch.cat((theirs, joint), -1)
+        if own is not None:
             mine = torch.cat((mine, own), -1)
         other = self.other(theirs).relu()
         n = other.shape[1]

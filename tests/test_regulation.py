@@ -1,6 +1,7 @@
 """Eq. 6, Algorithm 1 and the exact optimum, against hand-computed values and the oracles."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from itertools import product
 from random import Random
 
 import pytest
@@ -10,7 +11,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from rhmc.regulation import MOST_TARGETS, REGULATORS, algorithm1_path, executed, high_level_reward, optimal_path
-from rhmc.theorem import CROWDED, Instance, main, random_instances, shortfall_table, smallest_counterexample
+from rhmc.theorem import CROWDED, main, random_instances, shortfall_table, smallest_counterexample
 from tests.oracles import regulation as oracle
 
 B = 5  # instances per drawn shape
@@ -37,6 +38,22 @@ def apply(function: Callable[..., float], options: Tensor, assignment: Tensor, a
 def bits(*rows: str) -> Tensor:
     """bits("10", "01") is [[True, False], [False, True]]."""
     return torch.tensor([[c == "1" for c in row] for row in rows])
+
+
+def every_instance(n: int, d: int, m: int) -> Iterator[tuple[oracle.Options, oracle.Assignment]]:
+    """All options and assignments of a size, options within the assignment: per pair 2^d tables or, unassigned, one."""
+    tables = [(False, (False,) * d), *((True, table) for table in product((False, True), repeat=d))]
+    for pairs in product(tables, repeat=n * m):
+        rows = [pairs[i * m : (i + 1) * m] for i in range(n)]
+        yield (
+            [[[pair[1][o] for pair in row] for o in range(d)] for row in rows],
+            [[pair[0] for pair in row] for row in rows],
+        )
+
+
+def ones(options: oracle.Options, assignment: oracle.Assignment) -> int:
+    """How many bits of an instance are set."""
+    return sum(sum(map(sum, agent)) for agent in options) + sum(map(sum, assignment))
 
 
 @pytest.mark.parametrize(
@@ -170,6 +187,21 @@ def test_exact_refuses_too_many_targets(regulator: Callable[[Tensor, Tensor, flo
         regulator(torch.ones(1, 2, 2, m).bool(), torch.ones(1, 2, m), 0.1)
 
 
+def test_exact_weighs_the_penalty_against_shared_targets() -> None:
+    """One target of its own, or two that are shared by three agents: 1 - 2 alpha against 2/3 - alpha."""
+    options = torch.stack((bits("100", "011"), bits("000", "000"), bits("000", "000"))).unsqueeze(0)
+    assignment = bits("111", "011", "011").unsqueeze(0)
+    values = [REGULATORS["exact"](options, assignment, alpha).item() for alpha in (0.0, 0.3, 0.4, 1.0)]
+    assert values == pytest.approx([1, 1 - 0.6, 2 / 3 - 0.4, 2 / 3 - 1])
+    assert REGULATORS["paper"](options, assignment, 0.0).item() == pytest.approx(2 / 3)
+
+
+def test_exact_holds_the_number_of_ways_to_a_set() -> None:
+    """3^10 pairs of options complete everything where every subset of ten targets is an option: beyond 16 bits."""
+    options = torch.tensor(list(product((False, True), repeat=10))).expand(1, 2, 1024, 10)
+    assert REGULATORS["exact"](options, torch.ones(1, 2, 10), 0.5).item() == pytest.approx(5.0)
+
+
 def test_largest_exact_table() -> None:
     m = MOST_TARGETS
     options = torch.eye(m).bool().expand(1, 3, m, m)  # option d completes target d: three agents reach three targets
@@ -178,23 +210,29 @@ def test_largest_exact_table() -> None:
 
 def test_the_smallest_counterexample_by_reward() -> None:
     found = smallest_counterexample(alpha=0.2)
-    shape = tuple(found.options.shape)
-    assert shape == (2, 2, 2)
-    assert int(found.options.sum() + found.assignment.sum()) == 5
     rows = found.options.tolist(), found.assignment.tolist(), 0.2
     assert found.paper == pytest.approx(oracle.algorithm1(*rows)) == pytest.approx(0.5 - 0.2)
     assert found.exact == pytest.approx(oracle.optimum(*rows)) == pytest.approx(1 - 0.2)
+    assert tuple(found.options.shape) == (2, 2, 2)
+    failing = [case for case in every_instance(2, 2, 2) if oracle.optimum(*case, 0.2) > oracle.algorithm1(*case, 0.2)]
+    assert ones(*rows[:2]) == min(ones(*case) for case in failing)
 
 
 def test_the_smallest_counterexample_by_count() -> None:
     """Equal weight for every completed target does not save the theorem: the count itself is not maximal."""
+
+    def falls_short(options: oracle.Options, assignment: oracle.Assignment) -> bool:
+        best = max(map(sum, oracle.joint_options(options, assignment)))
+        return best > max(map(sum, oracle.algorithm1_masks(options, assignment)))
+
     found = smallest_counterexample(alpha=0.2, by="count")
+    rows = found.options.tolist(), found.assignment.tolist()
+    assert falls_short(*rows)
+    assert found.paper == pytest.approx(oracle.algorithm1(*rows, 0.2))
+    assert found.exact == pytest.approx(oracle.optimum(*rows, 0.2))
     assert tuple(found.options.shape) == (3, 2, 2)
-    assert _most_completed(found) == 2
-    path = algorithm1_path(found.options, found.assignment, 0.2)
-    assert sum(path.completed) == 1
-    assert found.paper == pytest.approx(path.reward)
-    assert found.exact > found.paper + 0.1
+    assert ones(*rows) == min(ones(*case) for case in every_instance(3, 2, 2) if falls_short(*case))
+    assert not any(falls_short(*case) for case in every_instance(2, 2, 2))
 
 
 def test_two_agents_reach_the_largest_count() -> None:
@@ -205,12 +243,6 @@ def test_two_agents_reach_the_largest_count() -> None:
         masks = (o & a.unsqueeze(1)).unbind(0)
         counts = (masks[0].unsqueeze(0) | masks[1].unsqueeze(1)).sum(-1)
         assert counts[path.choices[1]].max() == sum(path.completed)
-
-
-def _most_completed(found: Instance) -> int:
-    masks = found.options & found.assignment.unsqueeze(1)
-    joint = list(torch.cartesian_prod(*torch.arange(masks.shape[1]).repeat(len(masks), 1)))
-    return max(int(masks[range(len(masks)), o].any(0).sum()) for o in joint)
 
 
 def test_shortfall_table_counts_what_the_oracles_count() -> None:

@@ -2,8 +2,9 @@
 
 from typing import Any
 
-from rhmc.algorithms import iql
+from rhmc.algorithms import iql, rhmc
 
 ALGORITHMS: dict[str, tuple[type[Any], type[Any]]] = {
+    "rhmc": (rhmc.Config, rhmc.RHMC),
     "iql": (iql.Config, iql.IQL),
 }

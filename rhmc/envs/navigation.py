@@ -31,12 +31,12 @@ class Config(Frozen):
     """The task. `reward` and `order` both name a published version and are independent of each other."""
 
     kind: Literal["navigation"] = "navigation"
-    agents: int = Field(3, ge=1, description="N agents, and as many landmarks")
+    agents: int = Field(default=3, ge=1, description="N agents, and as many landmarks")
     reward: Literal["paper", "mpe2", "mpe1"] = "paper"
-    order: Order = Field("mpe2", description="integration: mpe2 moves, then changes velocity; mpe1 the other way round")
-    continuous: bool = Field(False, description="an action is a force in [-1, 1]^2 instead of one of five directions")
+    order: Order = Field(default="mpe2", description="integration: mpe2 moves first, mpe1 changes velocity first")
+    continuous: bool = Field(default=False, description="act by a force in [-1, 1]^2 instead of five directions")
     observation: Literal["paper", "extended"] = "paper"
-    episode: int = Field(25, ge=1)
+    episode: int = Field(default=25, ge=1)
 
 
 class State(NamedTuple):
@@ -137,6 +137,21 @@ def options(cfg: Config, state: State, horizon: int) -> Tensor:
     heading = overlap.unsqueeze(1) & reach.unsqueeze(2) & reach.unsqueeze(3)
     staying = _length(_relative(state.position, state.landmarks)) < NEAR
     return torch.cat((heading, staying.unsqueeze(2)), 2)
+
+
+def summary(cfg: Config, reward: Tensor, info: dict[str, Tensor]) -> dict[str, Tensor]:
+    """An episode: sums of the reward, of all three and of colliding pairs; share of landmarks covered at its end.
+
+    (T, B) each -> (B,) each.
+    """
+    sums = {f"return_{name}": info[f"reward_{name}"].sum(0) for name in ("paper", "mpe2", "mpe1")}
+    collisions = info["collisions"].sum(0)
+    return {
+        "return": reward.sum(0),
+        **sums,
+        "landmarks_covered": info["landmarks_covered"][-1],
+        "collisions": collisions,
+    }
 
 
 def reachable(cfg: Config, state: State, horizon: int) -> Tensor:

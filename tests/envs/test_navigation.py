@@ -23,6 +23,7 @@ ORDERS = ("mpe2", "mpe1")
 Start = Literal["spread", "crowded", "touching", "almost one point"]
 HALF_SIDES: dict[Start, float] = {"spread": 1.0, "crowded": 0.2, "touching": 0.02, "almost one point": 1e-6}
 LEVELS = {("random", "mpe2"): -78.5, ("hold", "mpe2"): -71.7, ("random", "paper"): -59.6, ("hold", "paper"): -50.8}
+COVERED = {"random": 0.01, "hold": 0.02}  # share of landmarks at the end
 
 starts = st.sampled_from(list(HALF_SIDES))
 seeds = st.integers(0, 2**31)
@@ -69,7 +70,7 @@ def scalar_world(state: navigation.State, row: int) -> oracle.World:
 
 
 def as_float32(state: navigation.State) -> navigation.State:
-    return navigation.State(*(part.float() for part in state[:3]), state.steps)
+    return navigation.State(state.position.float(), state.velocity.float(), state.landmarks.float(), state.steps)
 
 
 def assert_near(got: Tensor, want: object, tol: float) -> None:
@@ -148,6 +149,13 @@ def test_extended_features_equal_the_oracle(seed: int, n: int, start: Start) -> 
     assert_near(obs.peers[0], [[oracle.extended_peer(world, i, k) for k in range(n)] for i in range(n)], 1e-9)
     diagonal = obs.peers[0, range(n), range(n)]
     assert not diagonal.any()
+
+
+def test_a_tie_makes_both_agents_the_nearest() -> None:
+    cfg = navigation.Config(agents=2, observation="extended")
+    state = navigation.initial(cfg, 1, generator(0))
+    state = state._replace(position=torch.tensor([[[-1.0, 0.0], [1.0, 0.0]]]), landmarks=torch.zeros(1, 2, 2))
+    assert navigation.observe(cfg, state).pairs[0, ..., 2:].eq(1).all()  # distance, the other's, nearest
 
 
 def test_local_reward_is_mean_distance_to_assigned_landmarks_and_collisions() -> None:
@@ -360,15 +368,21 @@ def test_known_levels_are_met(policy: str) -> None:
     cfg = navigation.Config()
     env = make_env(cfg, 4000, generator(3))
     env.reset()
-    totals = dict.fromkeys(REWARDS, torch.zeros(4000))
+    steps = []
     for _ in range(cfg.episode):
         action = random_action(cfg, 4000, env.rng) * (policy == "random")
-        info = env.step(action).info
-        totals = {name: totals[name] + info[f"reward_{name}"] for name in REWARDS}
+        steps.append(env.step(action))
+    info = {key: torch.stack([step.info[key] for step in steps]) for key in steps[0].info}
+    summary = navigation.summary(cfg, torch.stack([step.reward for step in steps]), info)
     for name in ("mpe2", "paper"):
-        sem = float(totals[name].std()) / 4000**0.5
-        assert abs(float(totals[name].mean()) - LEVELS[policy, name]) < 4 * sem
-    assert_near(totals["mpe1"], 2 * totals["mpe2"] - 75, 1e-4)
+        total = summary[f"return_{name}"]
+        assert abs(float(total.mean()) - LEVELS[policy, name]) < 4 * float(total.std()) / 4000**0.5
+    assert torch.equal(summary["return"], summary["return_paper"])
+    assert_near(summary["return_mpe1"], 2 * summary["return_mpe2"] - 75, 1e-4)
+    assert_near(summary["collisions"], sum(step.info["collisions"] for step in steps), 1e-6)
+    covered = steps[-1].completed.any(1).float().mean(-1)
+    assert_near(summary["landmarks_covered"], covered, 1e-6)
+    assert abs(float(covered.mean()) - COVERED[policy]) < 0.01
 
 
 # ---- the regulator's table

@@ -1,12 +1,14 @@
 """Slow, readable twins of `rhmc.regulation`, on nested lists: options[i][d][j], assignment[i][j], one instance."""
 
+from collections.abc import Iterator
 from itertools import product
 
 Options = list[list[list[bool]]]
 Assignment = list[list[bool]]
+Completed = list[bool]
 
 
-def reward(completed: list[bool], assignment: Assignment, alpha: float) -> float:
+def reward(completed: Completed, assignment: Assignment, alpha: float) -> float:
     """Eq. 6, term by term."""
     total = 0.0
     for j, done in enumerate(completed):
@@ -18,21 +20,15 @@ def reward(completed: list[bool], assignment: Assignment, alpha: float) -> float
     return total
 
 
-def optimum(options: Options, assignment: Assignment, alpha: float) -> float:
-    """The best reward over every joint option."""
+def joint_options(options: Options, assignment: Assignment) -> Iterator[Completed]:
+    """What every joint option completes."""
     agents, targets = range(len(options)), range(len(assignment[0]))
-    return max(
-        reward(
-            [any(options[i][joint[i]][j] and assignment[i][j] for i in agents) for j in targets],
-            assignment,
-            alpha,
-        )
-        for joint in product(*(range(len(row)) for row in options))
-    )
+    for joint in product(*(range(len(row)) for row in options)):
+        yield [any(options[i][joint[i]][j] and assignment[i][j] for i in agents) for j in targets]
 
 
-def algorithm1(options: Options, assignment: Assignment, alpha: float) -> float:
-    """Algorithm 1, line by line, on binary sequences held as integers."""
+def algorithm1_masks(options: Options, assignment: Assignment) -> list[Completed]:
+    """Algorithm 1, lines 3 to 16, line by line on binary sequences held as integers: the last row of dp."""
     n, d, m = len(options), len(options[0]), len(assignment[0])
 
     def act(i: int, j: int) -> int:
@@ -50,7 +46,14 @@ def algorithm1(options: Options, assignment: Assignment, alpha: float) -> float:
                     dp[i][j] = mask
                 elif cnt(dp[i][j]) < cnt(dp[i - 1][k] | mask):
                     dp[i][j] = dp[i - 1][k] | mask
-    best = float("-inf")
-    for j in range(d):
-        best = max(best, reward([bool(dp[n - 1][j] >> t & 1) for t in range(m)], assignment, alpha))
-    return best
+    return [[bool(mask >> t & 1) for t in range(m)] for mask in dp[n - 1]]
+
+
+def optimum(options: Options, assignment: Assignment, alpha: float) -> float:
+    """The best reward over every joint option."""
+    return max(reward(completed, assignment, alpha) for completed in joint_options(options, assignment))
+
+
+def algorithm1(options: Options, assignment: Assignment, alpha: float) -> float:
+    """Algorithm 1, lines 17 to 20."""
+    return max(reward(completed, assignment, alpha) for completed in algorithm1_masks(options, assignment))
