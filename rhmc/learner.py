@@ -66,7 +66,8 @@ class Learner:
     def __init__(self, net: nn.Module, *, lr: float, polyak: float = 0.995, clip: float = 10.0) -> None:
         self.net, self.slow = net, deepcopy(net).requires_grad_(False)
         self.polyak, self.clip = polyak, clip
-        self.params, self.slow_params = list(net.parameters()), list(self.slow.parameters())
+        self.params: list[Tensor] = list(net.parameters())
+        self.slow_params: list[Tensor] = list(self.slow.parameters())
         self.optimiser = torch.optim.Adam(self.params, lr=lr, fused=True)
 
     def update(self, loss: Tensor) -> Tensor:

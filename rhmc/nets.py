@@ -7,6 +7,7 @@ any N and M.
 """
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Literal, NamedTuple
 
 import torch
@@ -37,7 +38,7 @@ class Sizes(NamedTuple):
 def mlp(*sizes: int) -> nn.Sequential:
     """Linear layers with ReLU between them; the last one is linear."""
     layers: list[nn.Module] = []
-    for i, o in zip(sizes[:-1], sizes[1:], strict=True):
+    for i, o in pairwise(sizes):
         layers += [nn.Linear(i, o), nn.ReLU()]
     return nn.Sequential(*layers[:-1])
 

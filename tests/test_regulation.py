@@ -197,9 +197,12 @@ def test_exact_weighs_the_penalty_against_shared_targets() -> None:
 
 
 def test_exact_holds_the_number_of_ways_to_a_set() -> None:
-    """3^10 pairs of options complete everything where every subset of ten targets is an option: beyond 16 bits."""
-    options = torch.tensor(list(product((False, True), repeat=10))).expand(1, 2, 1024, 10)
-    assert REGULATORS["exact"](options, torch.ones(1, 2, 10), 0.5).item() == pytest.approx(5.0)
+    """Sets that are a union in many ways, and sets that are none: more than 8 and 16 bits count."""
+    every = torch.tensor(list(product((False, True), repeat=10)))  # full set: 3^10 ways
+    few = every[every.sum(-1) <= 4]  # 386 options: two reach eight targets, never nine
+    assignment = torch.ones(1, 2, 10)
+    assert REGULATORS["exact"](every.expand(1, 2, -1, 10), assignment, 0.5).item() == pytest.approx(5)
+    assert REGULATORS["exact"](few.expand(1, 2, -1, 10), assignment, 0.5).item() == pytest.approx(4 - 2 * 0.5)
 
 
 def test_largest_exact_table() -> None:

@@ -57,7 +57,7 @@ class Config(Frozen):
     agents: int = Field(4, ge=1)
     targets: int = Field(5, ge=1)
     observation: Literal["paper", "extended"] = "paper"
-    penalty: float = Field(0.1, ge=0, description="taken as reward, negated, when nothing is captured; 0 gives coverage")
+    penalty: float = Field(0.1, ge=0, description="minus this is the reward when nothing is captured")
     boxes: tuple[tuple[int, int, int, int], ...] = BOXES
 
     @model_validator(mode="after")
@@ -65,7 +65,9 @@ class Config(Frozen):
         if self.agents > len(self.boxes):
             raise ValueError(f"agents: {self.agents} sensors need as many boxes, and there are {len(self.boxes)}")
         if PRESETS[self.preset].aimed and self.agents > self.targets:
-            raise ValueError(f"agents: preset 'executor' turns sensor i to target i, so agents <= targets = {self.targets}")
+            raise ValueError(
+                f"agents: preset 'executor' aims sensor i at target i, so agents <= targets = {self.targets}"
+            )
         return self
 
 
@@ -206,12 +208,15 @@ def observe(cfg: Config, state: State) -> Obs:
 
 
 def options(cfg: Config, state: State, horizon: int) -> Tensor:
-    """Targets each sensor would see under each heading that it can reach in `horizon` steps, targets where they are.
+    """Targets each sensor would see after `horizon` steps, under each heading that it can reach by then.
+
+    Targets are taken to go on as in their last move; where they will turn is not known.
 
     Returns:
         (B, N, D, M) bool with D = 2 horizon + 1; the middle option is the present heading.
     """
-    bearing, distance = relation(state)
+    ahead = state.targets + horizon * (state.targets - state.last)
+    bearing, distance = relation(state._replace(targets=ahead.clamp(-HALF_AREA, HALF_AREA)))
     turns = TURN * torch.arange(-horizon, horizon + 1, device=bearing.device)
     turned = wrap(bearing.unsqueeze(2) - turns.view(1, 1, -1, 1))
     return visible(turned, distance.unsqueeze(2))
@@ -262,4 +267,3 @@ def _displacement(targets: Tensor, goal: Tensor, speed: Tensor, u: Tensor, dt: f
 
 def _norm(v: Tensor) -> Tensor:
     return torch.linalg.vector_norm(v, dim=-1)
-

@@ -419,14 +419,21 @@ def test_the_table_bounds_every_discrete_plan(order: Any, horizon: int) -> None:
 
 
 @quick
-@given(seeds, st.sampled_from(ORDERS), st.integers(1, 12))
-def test_the_table_bounds_continuous_plans(seed: int, order: Any, horizon: int) -> None:
-    cfg = navigation.Config(agents=1, order=order, continuous=True)
-    state = lone_state(seed, 20, speed=2.0)
-    bound = navigation.reachable(cfg, state, horizon).flatten()
-    plan = uniform(generator(seed + 1), horizon, 1, 2)
-    for p in (plan, plan.sign()):
-        assert not (travel(cfg, state, p) & ~bound).any()
+@given(seeds, st.sampled_from(ORDERS), st.integers(2, 12), st.booleans(), st.sampled_from([0.0, 2.0, 20.0]))
+def test_wherever_a_plan_leads_is_reachable(
+    seed: int, order: Any, horizon: int, continuous: bool, speed: float
+) -> None:
+    """Also at great speed, where what one step and the next can reach do not overlap."""
+    cfg = navigation.Config(agents=1, order=order, continuous=continuous)
+    rng, batch = generator(seed), 200
+    start = end = lone_state(seed, batch, speed=speed)
+    plan = random_action(cfg, batch, rng)
+    for _ in range(horizon):
+        wavering = torch.rand(batch, generator=rng) < 0.3
+        plan = torch.where(wavering.view(-1, *[1] * (plan.dim() - 1)), random_action(cfg, batch, rng), plan)
+        end = navigation.transition(cfg, end, plan, rng)
+    there = start._replace(landmarks=end.position + 0.07 * uniform(rng, batch, 1, 2))
+    assert navigation.reachable(cfg, there, horizon).all()
 
 
 @quick

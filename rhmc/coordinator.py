@@ -1,0 +1,112 @@
+"""The high level: one policy that assigns targets to agents (sections 4.2 and 4.4, Eq. 6 to 9).
+
+Two gradients for the binary assignment. `ddpg` is Eq. 9 through a straight-through relaxed Bernoulli: it follows the
+critic's slope at assignments of 0 and 1, where the critic was never asked between them. `counterfactual` replaces that
+slope by the finite difference of the critic per pair, Q(s, g with g_ij = 1) - Q(s, g with g_ij = 0).
+"""
+
+from typing import Literal
+
+import torch
+from pydantic import Field
+from torch import Generator, Tensor, nn
+from torch.nn.functional import mse_loss, softplus
+
+from rhmc.learner import Learner, unpack
+from rhmc.nets import ENCODERS, EncoderName, Sizes, append
+from rhmc.sampling import bernoulli, mix, relaxed_bernoulli
+from rhmc.types import Batch, Frozen, Obs, Spec, State
+
+
+class Config(Frozen):
+    """Settings of the high level; lr and gamma are the paper's."""
+
+    encoder: EncoderName = "mlp"
+    hidden: int = Field(64, ge=1)
+    lr: float = Field(5e-4, gt=0)
+    polyak: float = Field(0.995, ge=0, le=1, description="share of the slow copies kept per update")
+    coordinator: Literal["ddpg", "counterfactual"] = "ddpg"
+    flips: int = Field(4, ge=1, description="pairs per state whose counterfactual an update looks at")
+    entropy: float = Field(0.2, ge=0, description="weight of the assignment's entropy, for advantages of deviation 1")
+    gamma_h: float = Field(0.99, ge=0, le=1, description="per assignment period")
+    flip: float = Field(0.05, ge=0, le=1, description="share of pairs assigned at random while exploring")
+    batch_h: int = Field(256, ge=1, description="rows of an update")
+
+
+class Coordinator:
+    """Actor over all pairs and the critic of an assignment. Assignments are (B, N, M) float, 0 or 1."""
+
+    def __init__(self, cfg: Config, spec: Spec, rng: Generator) -> None:
+        self.cfg, self.rng = cfg, rng
+        self.gain = {"ddpg": self._slope, "counterfactual": self._difference}[cfg.coordinator]
+        encoder = ENCODERS[cfg.encoder]
+        actor = encoder.pairs(Sizes.of(spec), cfg.hidden, 1).to(rng.device)
+        critic = encoder.pairs(Sizes.of(spec, pair=1), cfg.hidden, 1).to(rng.device)
+        self.actor = Learner(actor, lr=cfg.lr, polyak=cfg.polyak)
+        self.critic = Learner(critic, lr=cfg.lr, polyak=cfg.polyak)
+
+    def assign(self, obs: Obs, rng: Generator, *, explore: bool) -> Tensor:
+        """Assignment (B, N, M): drawn from the softened policy, or its threshold at 1/2."""
+        logits = self.actor.net(obs).squeeze(-1)
+        if explore:
+            return bernoulli(mix(logits.sigmoid(), 0.5, self.cfg.flip), rng)
+        return (logits > 0).float()
+
+    def update(self, rows: Batch) -> Batch:
+        """One step of the critic (Eq. 7) and one of the actor (Eq. 9)."""
+        obs, after = unpack(rows), unpack(rows, "next_")
+        with torch.no_grad():
+            best = (self.actor.slow(after).squeeze(-1) > 0).float()
+            live = (~rows["terminal"]).float()
+            target = rows["reward"] + self.cfg.gamma_h * live * worth(self.critic.slow, after, best)
+        q = worth(self.critic.net, obs, rows["assignment"])
+        td = mse_loss(q, target)
+        self.critic.update(td)
+        logits = self.actor.net(obs).squeeze(-1)
+        self.actor.update(-self.gain(obs, logits))
+        logs = {"high_td": td, "high_q": q.mean(), "high_logit": logits.abs().mean()}
+        logs |= {"assigned": rows["assignment"].sum((1, 2)).mean(), "earned": rows["earned"].mean()}
+        return logs | {"regulated": rows["reward"].mean()}
+
+    def _slope(self, obs: Obs, logits: Tensor) -> Tensor:
+        return worth(self.critic.net, obs, relaxed_bernoulli(logits, self.rng)).mean()
+
+    def _difference(self, obs: Obs, logits: Tensor) -> Tensor:
+        """Expected advantage of the Bernoulli chances plus entropy; advantages scaled to deviation 1."""
+        chance = logits.sigmoid()
+        with torch.no_grad():
+            drawn = bernoulli(chance, self.rng)
+            which, advantage = differences(self.critic.net, obs, drawn, self.cfg.flips, self.rng)
+            advantage = advantage / advantage.std().clamp(min=1e-6)
+        entropy = softplus(logits) - logits * chance
+        return (chance.flatten(1).gather(1, which) * advantage).mean() + self.cfg.entropy * entropy.mean()
+
+    def state_dict(self) -> State:
+        """Both networks."""
+        return {"actor": self.actor.state_dict(), "critic": self.critic.state_dict()}
+
+    def load_state_dict(self, state: State) -> None:
+        """Continue from `state_dict`."""
+        self.actor.load_state_dict(state["actor"])
+        self.critic.load_state_dict(state["critic"])
+
+
+def worth(critic: nn.Module, obs: Obs, assignment: Tensor) -> Tensor:
+    """The critic's value of an assignment, a sum over pairs: (B, N, M) -> (B,)."""
+    return critic(append(obs, pair=assignment.unsqueeze(-1))).sum((1, 2, 3))
+
+
+def differences(critic: nn.Module, obs: Obs, assignment: Tensor, flips: int, rng: Generator) -> tuple[Tensor, Tensor]:
+    """Q(s, g with g_ij = 1) - Q(s, g with g_ij = 0) for `flips` pairs of each state, drawn without replacement.
+
+    Returns:
+        Index of the pairs into (N M), and the differences: (B, flips) each.
+    """
+    b, n, m = assignment.shape
+    which = torch.rand(b, n * m, generator=rng, device=rng.device).argsort(-1)[:, :flips]
+    flat = assignment.flatten(1)
+    now = flat.gather(1, which)
+    flipped = flat.unsqueeze(1).repeat(1, which.shape[1], 1).scatter_(2, which.unsqueeze(-1), 1 - now.unsqueeze(-1))
+    many = Obs(*(x.repeat_interleave(which.shape[1], 0) for x in obs))
+    change = worth(critic, many, flipped.view(-1, n, m)).view(b, -1) - worth(critic, obs, assignment).unsqueeze(1)
+    return which, change * (1 - 2 * now)

@@ -1,0 +1,105 @@
+"""The low level: shared actor and central critic that act under an assignment (section 4.3, Eq. 10 to 13).
+
+The actor sees its own (filtered) row and its assignment; the critic sees everything, every assignment and the other
+agents' actions, and has one output per own action. The bootstrap keeps the assignment that was acted under, so that the
+executors' task does not change with the coordinator.
+"""
+
+from typing import Literal
+
+import torch
+from pydantic import Field
+from torch import Generator, Tensor
+from torch.nn.functional import mse_loss, one_hot
+
+from rhmc.filters import FILTERS
+from rhmc.learner import Learner, pack, unpack
+from rhmc.nets import ENCODERS, EncoderName, Sizes, append
+from rhmc.sampling import gumbel, mix
+from rhmc.types import Batch, Frozen, Obs, Spec, State, Transition, assigned_reward
+
+
+class Config(Frozen):
+    """Settings of the low level; lr and gamma are the paper's."""
+
+    encoder: EncoderName = "mlp"
+    hidden: int = Field(64, ge=1)
+    lr: float = Field(5e-4, gt=0)
+    polyak: float = Field(0.995, ge=0, le=1, description="share of the slow copies kept per update")
+    filter: Literal["on", "off"] = Field("on", description="hide unassigned targets from the executors (Eq. 10)")
+    executor: Literal["gumbel", "expected"] = Field(
+        "gumbel", description="actor's gradient: straight-through Gumbel-softmax, or the expectation over own actions"
+    )
+    gamma_l: float = Field(0.99, ge=0, le=1)
+    epsilon: float = Field(0.05, ge=0, le=1, description="share of actions drawn at random while exploring")
+    logit_penalty: float = Field(1e-3, ge=0, description="weight of the squared logits (as in MADDPG)")
+    batch: int = Field(256, ge=1, description="rows of an update")
+
+
+class Executor:
+    """All executors: one actor and one critic, shared parameters. Assignments are (B, N, M) float, 0 or 1."""
+
+    def __init__(self, cfg: Config, spec: Spec, rng: Generator) -> None:
+        self.cfg, self.actions, self.rng = cfg, spec.actions, rng
+        self.filter = FILTERS[cfg.filter]
+        self.policy = {"gumbel": self._straight_through, "expected": lambda logits: logits.softmax(-1)}[cfg.executor]
+        encoder, sizes = ENCODERS[cfg.encoder], Sizes.of(spec, pair=1)
+        actor = encoder.local(sizes, cfg.hidden, spec.actions).to(rng.device)
+        critic = encoder.central(sizes, cfg.hidden, spec.actions, joint=spec.actions).to(rng.device)
+        self.actor = Learner(actor, lr=cfg.lr, polyak=cfg.polyak)
+        self.critic = Learner(critic, lr=cfg.lr, polyak=cfg.polyak)
+
+    def act(self, obs: Obs, assignment: Tensor, rng: Generator, *, explore: bool) -> Tensor:
+        """Actions (B, N) int64: sampled from the softened policy, or its greatest logit."""
+        logits = self.actor.net(self._seen(obs, assignment))
+        if explore:
+            logits = mix(logits.softmax(-1), 1 / self.actions, self.cfg.epsilon).log() + gumbel(logits.shape, rng)
+        return logits.argmax(-1)
+
+    def rows(self, t: Transition, assignment: Tensor) -> Batch:
+        """One row per environment of Alg. 2's B_l."""
+        rows = pack(t.obs) | pack(t.next_obs, "next_") | {"action": t.action, "terminal": t.terminal}
+        return rows | {"assignment": assignment, "reward": assigned_reward(t.local, assignment)}
+
+    def update(self, rows: Batch) -> Batch:
+        """One step of the critic (Eq. 11) and one of the actor (Eq. 13, ascent)."""
+        g, obs, joint = rows["assignment"], unpack(rows), self._one_hot(rows["action"])
+        q = self.critic.net(_told(obs, g), joint=joint)
+        chosen = q.gather(-1, rows["action"].unsqueeze(-1)).squeeze(-1)
+        td = mse_loss(chosen, self._target(rows))
+        logits = self.actor.net(self._seen(obs, g))
+        gain = (q.detach() * self.policy(logits)).sum(-1).mean()
+        self.critic.update(td)
+        self.actor.update(self.cfg.logit_penalty * logits.square().mean() - gain)
+        logs = {"low_td": td, "low_q": chosen.mean(), "low_reward": rows["reward"].mean()}
+        return logs | {"low_logit": logits.abs().mean()}
+
+    @torch.no_grad()
+    def _target(self, rows: Batch) -> Tensor:
+        g, after = rows["assignment"], unpack(rows, "next_")
+        best = self.actor.slow(self._seen(after, g)).argmax(-1)
+        value = self.critic.slow(_told(after, g), joint=self._one_hot(best)).gather(-1, best.unsqueeze(-1)).squeeze(-1)
+        return rows["reward"] + self.cfg.gamma_l * (~rows["terminal"]).unsqueeze(-1) * value
+
+    def _straight_through(self, logits: Tensor) -> Tensor:
+        soft = (logits + gumbel(logits.shape, self.rng)).softmax(-1)
+        return self._one_hot(soft.argmax(-1)) + soft - soft.detach()
+
+    def _seen(self, obs: Obs, assignment: Tensor) -> Obs:
+        return _told(obs._replace(pairs=self.filter(obs.pairs, assignment)), assignment)
+
+    def _one_hot(self, action: Tensor) -> Tensor:
+        return one_hot(action, self.actions).float()
+
+    def state_dict(self) -> State:
+        """Both networks."""
+        return {"actor": self.actor.state_dict(), "critic": self.critic.state_dict()}
+
+    def load_state_dict(self, state: State) -> None:
+        """Continue from `state_dict`."""
+        self.actor.load_state_dict(state["actor"])
+        self.critic.load_state_dict(state["critic"])
+
+
+def _told(obs: Obs, assignment: Tensor) -> Obs:
+    return append(obs, pair=assignment.unsqueeze(-1))
