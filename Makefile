@@ -1,0 +1,80 @@
+# `make repro` makes the results, `make test` checks everything. Both set themselves up with Python 3.11, git and make.
+#
+#   PYTHON=...           the Python 3.11 to use, where `python3.11` is not on the path
+#   PIP_TORCH_ARGS=...   options for the installation of torch alone, such as the index that has its CPU build
+#   JOBS=2               tests at once
+
+SHELL := bash
+.SHELLFLAGS := -euo pipefail -c
+.DELETE_ON_ERROR:
+.DEFAULT_GOAL := help
+
+PIP_TORCH_ARGS ?=
+JOBS ?= 2
+PROFILE := $(shell sed -n 's/^profile: *//p' params.yaml)
+IS_311 := -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))'
+PYTHON ?= $(shell for p in python3.11 python3; do $$p $(IS_311) 2>/dev/null && echo $$p && break; done)
+READY := .venv/.ready
+
+# The environment's own programs first: `rhmc` in a DVC stage is this project's.
+export PATH := $(CURDIR)/.venv/bin:$(PATH)
+export DVC_SITE_CACHE_DIR := $(CURDIR)/.dvc/tmp/site
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+export PIP_NO_INPUT := 1
+unexport PYTHONPATH
+
+.PHONY: help setup repro test check bench report ui lock clean
+
+help: ## What there is to make
+	@grep -hE '^[a-z]+:.*## ' Makefile | sed -E 's/^([a-z]+):[^#]*## /  make \1\t/' | expand -t 14
+
+setup: $(READY) ## The environment in .venv, exactly as in requirements.lock
+
+repro: $(READY) ## Train, track and report on the profile in params.yaml; an interrupted one continues
+	@dvc repro || { echo "Not finished. What is done is kept: \`make repro\` continues."; exit 1; }
+	@echo
+	@echo "Report:    reports/$(PROFILE)/index.md"
+	@echo "MLflow UI: run \`make ui\` and open the address that it prints"
+
+test: check ## Lint, types and every test
+	@python -m pytest -n $(JOBS)
+
+check: $(READY) ## Lint and types only
+	@ruff check --quiet .
+	@ruff format --quiet --check . || { echo "Run \`ruff format .\`"; exit 1; }
+	@mypy --no-error-summary
+
+bench: $(READY) ## Speed of the environments and of training, as Markdown tables
+	@python benchmarks/env_speed.py
+	@python benchmarks/train_speed.py
+
+report: $(READY) ## The report again, from the exported runs
+	@rhmc report --profile $(PROFILE)
+
+ui: $(READY) ## The runs in MLflow's web interface
+	@rhmc ui
+
+lock: $(READY) ## Write requirements.lock from .venv, after a deliberate change there
+	@{ sed '/^[^#]/,$$d' requirements.lock; pip freeze --all --exclude-editable | grep -v '^pip==' \
+	  | sed 's/+cpu$$//' | LC_ALL=C sort -f; } > requirements.lock.new
+	@mv requirements.lock.new requirements.lock
+
+clean: ## Remove .venv and caches; results stay
+	@rm -rf .venv .mypy_cache .pytest_cache .ruff_cache .hypothesis build *.egg-info
+	@find rhmc pipelines reports benchmarks tests -name __pycache__ -prune -exec rm -rf {} +
+	@echo "Removed .venv and the caches. Kept every result: work/ (runs, checkpoints) and reports/ (remove by hand)."
+
+# torch comes first and alone, so that a build with CUDA is seen before its packages are fetched.
+$(READY): requirements.lock pyproject.toml
+	@test -n "$(PYTHON)" || { echo "Python 3.11 is needed: no python3.11 here, and python3 is another version." \
+	  "Give its path: make PYTHON=/path/to/python3.11"; exit 1; }
+	@$(PYTHON) $(IS_311) || { echo "Python 3.11 is needed, and $(PYTHON) is another version."; exit 1; }
+	@echo "Setting up .venv: some minutes, 2.3 GB"
+	@test -x .venv/bin/python || $(PYTHON) -m venv .venv
+	@python -m pip install --quiet --no-deps $(PIP_TORCH_ARGS) "$$(grep '^torch==' requirements.lock)"
+	@python .ci/cpu_only.py
+	@python -m pip install --quiet -r requirements.lock
+	@python -m pip install --quiet --no-deps --no-build-isolation --editable .
+	@python .ci/cpu_only.py
+	@python -m pip check
+	@touch $(READY)

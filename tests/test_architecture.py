@@ -1,0 +1,261 @@
+"""The arrows between the parts, read from the syntax trees: what may import what, and that the tables are complete."""
+
+import ast
+import re
+import sys
+import tomllib
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from ruamel.yaml import YAML
+
+from rhmc.algorithms import ALGORITHMS
+
+ROOT = Path(__file__).parents[1]
+PAGE = 200  # lines that a method may take
+
+# Beside the standard library, each package imports these and nothing else.
+ALLOWED = {
+    "rhmc": {"rhmc", "torch", "pydantic"},
+    "pipelines": {
+        *("pipelines", "rhmc", "torch", "pydantic", "pydantic_core", "ruamel", "filelock", "rich", "pandas", "pyarrow")
+    },
+    "reports": {
+        *("reports", "numpy", "pandas", "scipy", "matplotlib", "cycler", "pyarrow", "pydantic", "ruamel", "jinja2"),
+        "tabulate",
+    },
+}
+# What only these files may import.
+ONLY = {
+    "mlflow": {"pipelines/mlflow_tracker.py"},
+    "sqlalchemy": {"pipelines/mlflow_tracker.py"},
+    "ray": {"pipelines/ray_driver.py", "pipelines/trainable.py"},
+    "typer": {"pipelines/cli.py"},
+    "reports": {"pipelines/cli.py"},
+}
+# What these must not import: a physics knows no learner, a regulator neither task nor network.
+BARRED = {
+    "rhmc/envs/": ("rhmc.algorithms", "rhmc.learner", "rhmc.nets", "rhmc.trainer", "rhmc.evaluate"),
+    "rhmc/regulation.py": ("rhmc.envs", "rhmc.algorithms", "rhmc.nets", "rhmc.learner", "rhmc.trainer"),
+    "rhmc/filters.py": ("rhmc.envs", "rhmc.algorithms", "rhmc.nets", "rhmc.learner", "rhmc.trainer"),
+    "rhmc/algorithms/": ("rhmc.trainer", "rhmc.evaluate", "rhmc.scripted"),
+}
+# What loading these must not load: help has to answer at once, a check of a study in seconds.
+HEAVY = {"torch", "ray", "mlflow", "numpy", "pandas", "scipy", "matplotlib", "pyarrow", "pydantic"}
+LIGHT = {"pipelines.cli": HEAVY, "pipelines.study": HEAVY - {"torch", "numpy", "pydantic"}}
+
+
+class Import(NamedTuple):
+    """One imported module; `eager` if importing the file imports it."""
+
+    module: str
+    eager: bool
+    line: int
+
+    @property
+    def top(self) -> str:
+        return self.module.split(".")[0]
+
+
+def imports(path: str, source: str) -> Iterator[Import]:
+    """Every import of a file, those inside functions and by name included; names of `from a import b` count as a.b."""
+    lazy = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
+    stack: list[tuple[ast.AST, bool]] = [(ast.parse(source), True)]
+    while stack:
+        node, eager = stack.pop()
+        yield from (Import(module, eager, node.lineno) for module in _modules(path, node))  # type: ignore[attr-defined]
+        typing_only = isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING")
+        inner = eager and not isinstance(node, lazy) and not typing_only
+        stack += [(child, inner) for child in ast.iter_child_nodes(node)]
+
+
+def _modules(path: str, node: ast.AST) -> list[str]:
+    if isinstance(node, ast.Import):
+        return [alias.name for alias in node.names]
+    if isinstance(node, ast.ImportFrom):
+        package = path.split("/")[: -node.level] if node.level else []
+        base = ".".join([*package, node.module or ""]).strip(".")
+        return [base, *(f"{base}.{alias.name}" for alias in node.names)]
+    if isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] in {"import_module", "__import__"}:
+        return [ast.literal_eval(a) for a in node.args[:1] if isinstance(a, ast.Constant)]
+    return []
+
+
+def faults(path: str, source: str) -> list[str]:
+    """Imports of the file `path` (from the root, with slashes) that break the tables above, one line each."""
+    own = path.split("/")[0]
+    barred = tuple(name for prefix, names in BARRED.items() if path.startswith(prefix) for name in names)
+    found = set()
+    for item in imports(path, source):
+        allowed = ALLOWED[own] | {name for name, files in ONLY.items() if path in files}
+        if item.top not in allowed and item.top not in sys.stdlib_module_names:
+            found.add(f"{path}:{item.line}: {own} may not import {item.top}")
+        if any(f"{item.module}.".startswith(f"{name}.") for name in barred):
+            found.add(f"{path}:{item.line}: this file may not import {item.module}")
+    return sorted(found)
+
+
+def loaded(module: str, sources: dict[str, str]) -> set[str]:
+    """Top-level names that importing `module` imports, through the modules in `sources` (by dotted name)."""
+    seen: set[str] = set()
+    todo = [module]
+    while todo:
+        name = todo.pop()
+        if name not in seen:
+            seen.add(name)
+            path = name.replace(".", "/") + ".py"
+            todo += [i.module for i in imports(path, sources.get(name, "")) if i.eager]
+            todo += [name.rpartition(".")[0]] if "." in name else []
+    return {name.split(".")[0] for name in seen}
+
+
+def files() -> list[str]:
+    return sorted(p.relative_to(ROOT).as_posix() for name in ALLOWED for p in (ROOT / name).rglob("*.py"))
+
+
+def modules() -> dict[str, str]:
+    return {
+        path.removesuffix(".py").removesuffix("/__init__").replace("/", "."): (ROOT / path).read_text(encoding="utf-8")
+        for path in files()
+    }
+
+
+def unmatched(what: str, wanted: Iterable[str], listed: Iterable[str]) -> list[str]:
+    """Names that are on one side only, one line each."""
+    wanted, listed = set(wanted), set(listed)
+    return [f"{what}: {n} is not listed" for n in sorted(wanted - listed)] + [
+        f"{what}: {n} is listed and is not there" for n in sorted(listed - wanted)
+    ]
+
+
+# Imports
+
+
+@pytest.mark.parametrize("path", files())
+def test_imports_follow_the_arrows(path: str) -> None:
+    assert faults(path, (ROOT / path).read_text(encoding="utf-8")) == []
+
+
+@pytest.mark.parametrize(
+    ("path", "source", "named"),
+    [
+        ("rhmc/nets.py", "import numpy", "numpy"),
+        ("rhmc/nets.py", "import torch, pandas as pd", "pandas"),
+        ("rhmc/trainer.py", "def f():\n    from pipelines import study", "pipelines"),
+        ("rhmc/trainer.py", "from importlib import import_module\nimport_module('mlflow')", "mlflow"),
+        ("rhmc/envs/coverage.py", "from rhmc.algorithms import ALGORITHMS", "rhmc.algorithms"),
+        ("rhmc/envs/coverage.py", "from rhmc import trainer", "rhmc.trainer"),
+        ("rhmc/envs/coverage.py", "from ..nets import mlp", "rhmc.nets"),
+        ("rhmc/regulation.py", "import rhmc.envs.coverage", "rhmc.envs"),
+        ("reports/figures.py", "from rhmc.types import Frozen", "rhmc"),
+        ("reports/build.py", "try:\n    import pipelines.export\nexcept ImportError:\n    pass", "pipelines"),
+        ("reports/frame.py", "import torch", "torch"),
+        ("reports/frame.py", "from mlflow import MlflowClient", "mlflow"),
+        ("pipelines/run.py", "def f():\n    import mlflow", "mlflow"),
+        ("pipelines/study.py", "from ray import tune", "ray"),
+        ("pipelines/export.py", "import reports.build", "reports"),
+    ],
+)
+def test_a_wrong_import_is_found(path: str, source: str, named: str) -> None:
+    found = faults(path, source)
+    assert len(found) >= 1
+    assert all(named in line for line in found)
+
+
+def test_right_imports_pass() -> None:
+    source = "import json\nfrom typing import Any\nimport torch\nfrom rhmc.types import Obs\nfrom .base import Env"
+    assert faults("rhmc/envs/coverage.py", source) == []
+    assert faults("pipelines/mlflow_tracker.py", "import mlflow") == []
+    assert faults("pipelines/cli.py", "def report():\n    from reports import build") == []
+
+
+@pytest.mark.parametrize("module", LIGHT)
+def test_light_modules_load_nothing_heavy(module: str) -> None:
+    sources = modules()
+    assert module in sources
+    assert loaded(module, sources) & LIGHT[module] == set()
+
+
+def test_a_heavy_import_is_found_at_any_depth() -> None:
+    study = "class A:\n    try:\n        from pipelines import run\n    finally:\n        pass"
+    sources = {"pipelines.cli": "import typer\nfrom pipelines.study import A", "pipelines.study": study}
+    lazy = "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import torch\ndef f():\n    import mlflow"
+    assert loaded("pipelines.cli", sources | {"pipelines.run": lazy}) & HEAVY == set()
+    assert loaded("pipelines.cli", sources | {"pipelines.run": lazy + "\nimport ray.tune"}) & HEAVY == {"ray"}
+    assert "torch" in loaded("pipelines.cli", sources | {"pipelines": "import torch"})
+
+
+# Tables
+
+
+def test_every_method_is_in_the_table() -> None:
+    pages = {p.stem for p in (ROOT / "rhmc/algorithms").glob("*.py")} - {"__init__", "base"}
+    listed = {cls.__module__.rpartition(".")[2] for _, cls in ALGORITHMS.values()}
+    assert unmatched("ALGORITHMS", pages, listed) == []
+
+
+@pytest.mark.parametrize("page", sorted((ROOT / "rhmc/algorithms").glob("*.py")), ids=lambda page: page.stem)
+def test_a_method_is_a_page(page: Path) -> None:
+    assert len(page.read_text(encoding="utf-8").splitlines()) <= PAGE
+
+
+@pytest.fixture(scope="module")
+def stages() -> dict:
+    return YAML(typ="safe").load((ROOT / "dvc.yaml").read_text(encoding="utf-8"))["stages"]
+
+
+def test_every_study_is_in_the_pipeline(stages: dict) -> None:
+    assert unmatched("dvc.yaml", {p.stem for p in (ROOT / "studies").glob("*.yaml")}, stages["study"]["foreach"]) == []
+
+
+def test_the_report_depends_on_all_its_modules(stages: dict) -> None:
+    parts = {p.relative_to(ROOT).as_posix() for p in (ROOT / "reports").glob("*") if p.suffix in {".py", ".yaml"}}
+    listed = {d for d in stages["report"]["deps"] if "${" not in d}
+    assert unmatched("dvc.yaml", parts - {"reports/__init__.py"}, listed) == []
+
+
+def test_every_stage_that_computes_waits_for_the_fingerprint(stages: dict) -> None:
+    for stage in (stages["study"]["do"], stages["yardsticks"]):
+        assert ".fingerprint" in stage["deps"]
+    assert ".fingerprint" in stages["fingerprint"]["outs"][0]
+
+
+def test_unmatched_names_both_sides() -> None:
+    assert unmatched("x", {"a", "b"}, ["b", "c"]) == ["x: a is not listed", "x: c is listed and is not there"]
+    assert unmatched("x", {"a"}, ["a"]) == []
+
+
+# The lock
+
+
+def pins(lines: Iterable[str]) -> dict[str, str]:
+    """Version by normalised name; a line that is no exact pin is an error."""
+    found = {}
+    for line in lines:
+        match = re.fullmatch(r"([A-Za-z0-9._-]+)(?:\[\w+\])?==([\w.]+)", line)
+        assert match, f"not an exact pin: {line!r}"
+        found[re.sub(r"[-_.]+", "-", match[1]).lower()] = match[2]
+    return found
+
+
+def locked() -> dict[str, str]:
+    lines = (ROOT / "requirements.lock").read_text(encoding="utf-8").splitlines()
+    return pins(line for line in lines if not line.startswith("#"))
+
+
+def test_the_lock_holds_every_direct_dependency_as_pinned() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    direct = pins(project["dependencies"] + project["optional-dependencies"]["test"])
+    assert direct.items() <= locked().items()
+
+
+def test_the_lock_holds_no_cuda() -> None:
+    assert [name for name in locked() if re.match(r"nvidia|cuda|triton", name)] == []
+
+
+@pytest.mark.parametrize("line", ["torch", "torch>=2", "torch==2.13.0+cpu", "torch @ file:///wheel", "-e ."])
+def test_a_loose_pin_is_an_error(line: str) -> None:
+    with pytest.raises(AssertionError, match="not an exact pin"):
+        pins([line])
