@@ -13,7 +13,7 @@ from torch import Generator, Tensor, nn
 from torch.nn.functional import mse_loss, softplus
 
 from rhmc.learner import Learner, unpack
-from rhmc.nets import ENCODERS, EncoderName, Sizes, append
+from rhmc.nets import ENCODERS, EncoderName, PairNet, Sizes, append
 from rhmc.sampling import bernoulli, mix, relaxed_bernoulli
 from rhmc.types import Batch, Frozen, Obs, Spec, State
 
@@ -26,7 +26,6 @@ class Config(Frozen):
     lr: float = Field(5e-4, gt=0)
     polyak: float = Field(0.995, ge=0, le=1, description="share of the slow copies kept per update")
     coordinator: Literal["ddpg", "counterfactual"] = "ddpg"
-    flips: int = Field(4, ge=1, description="pairs per state whose counterfactual an update looks at")
     entropy: float = Field(0.2, ge=0, description="weight of the assignment's entropy, for advantages of deviation 1")
     gamma_h: float = Field(0.99, ge=0, le=1, description="per assignment period")
     flip: float = Field(0.05, ge=0, le=1, description="share of pairs assigned at random while exploring")
@@ -75,11 +74,10 @@ class Coordinator:
         """Expected advantage of the Bernoulli chances plus entropy; advantages scaled to deviation 1."""
         chance = logits.sigmoid()
         with torch.no_grad():
-            drawn = bernoulli(chance, self.rng)
-            which, advantage = differences(self.critic.net, obs, drawn, self.cfg.flips, self.rng)
+            advantage = differences(self.critic.net, obs, bernoulli(chance, self.rng))
             advantage = advantage / advantage.std().clamp(min=1e-6)
         entropy = softplus(logits) - logits * chance
-        return (chance.flatten(1).gather(1, which) * advantage).mean() + self.cfg.entropy * entropy.mean()
+        return (chance * advantage + self.cfg.entropy * entropy).mean()
 
     def state_dict(self) -> State:
         """Both networks."""
@@ -96,17 +94,8 @@ def worth(critic: nn.Module, obs: Obs, assignment: Tensor) -> Tensor:
     return critic(append(obs, pair=assignment.unsqueeze(-1))).sum((1, 2, 3))
 
 
-def differences(critic: nn.Module, obs: Obs, assignment: Tensor, flips: int, rng: Generator) -> tuple[Tensor, Tensor]:
-    """Q(s, g with g_ij = 1) - Q(s, g with g_ij = 0) for `flips` pairs of each state, drawn without replacement.
-
-    Returns:
-        Index of the pairs into (N M), and the differences: (B, flips) each.
-    """
-    b, n, m = assignment.shape
-    which = torch.rand(b, n * m, generator=rng, device=rng.device).argsort(-1)[:, :flips]
-    flat = assignment.flatten(1)
-    now = flat.gather(1, which)
-    flipped = flat.unsqueeze(1).repeat(1, which.shape[1], 1).scatter_(2, which.unsqueeze(-1), 1 - now.unsqueeze(-1))
-    many = Obs(*(x.repeat_interleave(which.shape[1], 0) for x in obs))
-    change = worth(critic, many, flipped.view(-1, n, m)).view(b, -1) - worth(critic, obs, assignment).unsqueeze(1)
-    return which, change * (1 - 2 * now)
+def differences(critic: PairNet, obs: Obs, assignment: Tensor) -> Tensor:
+    """Q(s, g with g_ij = 1) - Q(s, g with g_ij = 0) for every pair, the other pairs as in `assignment`. (B, N, M)."""
+    told = append(obs, pair=assignment.unsqueeze(-1))
+    change = critic.flips(told) - critic(told).sum((1, 2, 3)).view(-1, 1, 1)
+    return change * (1 - 2 * assignment)

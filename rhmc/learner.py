@@ -1,14 +1,14 @@
 """What every learner shares: a replay of rows, and a network with its slow copy and optimiser."""
 
-from collections.abc import Callable
 from copy import deepcopy
+from typing import Generic, TypeVar
 
 import torch
 from torch import Generator, Tensor, nn
 
 from rhmc.types import Batch, Obs, State
 
-Loss = Callable[..., tuple[Tensor, Batch]]
+Net = TypeVar("Net", bound=nn.Module)
 
 
 class Replay:
@@ -42,7 +42,7 @@ class Replay:
 
     def state_dict(self) -> State:
         """The filled rows and the ring's position; the generator belongs to its owner."""
-        return {"rows": {k: v[: self.size] for k, v in self.rows.items()}, "next": self.next, "size": self.size}
+        return {"rows": {k: v[: self.size].clone() for k, v in self.rows.items()}, "next": self.next, "size": self.size}
 
     def load_state_dict(self, state: State) -> None:
         """Continue from `state_dict`."""
@@ -53,7 +53,7 @@ class Replay:
             self.rows[key][: self.size] = value.to(self.rng.device)
 
 
-class Learner:
+class Learner(Generic[Net]):
     """A network, its slowly following copy and its optimiser. The loss is handed in at each update.
 
     Args:
@@ -63,7 +63,7 @@ class Learner:
         clip: largest norm of the gradient.
     """
 
-    def __init__(self, net: nn.Module, *, lr: float, polyak: float = 0.995, clip: float = 10.0) -> None:
+    def __init__(self, net: Net, *, lr: float, polyak: float = 0.995, clip: float = 10.0) -> None:
         self.net, self.slow = net, deepcopy(net).requires_grad_(False)
         self.polyak, self.clip = polyak, clip
         self.params: list[Tensor] = list(net.parameters())

@@ -81,7 +81,15 @@ class FlatCentral(nn.Module):
         return self.net(torch.cat(parts, -1))
 
 
-class FlatPairs(nn.Module):
+class PairNet(nn.Module):
+    """A network of the third shape: features of every pair -> (B, N, M, out)."""
+
+    def flips(self, obs: Obs) -> Tensor:
+        """The output summed over pairs if one pair's last feature, 0 or 1, were the other: (B, N, M), one at a time."""
+        raise NotImplementedError
+
+
+class FlatPairs(PairNet):
     """All rows, flattened -> (B, N, M, out)."""
 
     def __init__(self, sizes: Sizes, hidden: int, out: int) -> None:
@@ -91,6 +99,21 @@ class FlatPairs(nn.Module):
 
     def forward(self, obs: Obs) -> Tensor:
         return self.net(_rows(obs).flatten(1)).unflatten(1, self.shape)
+
+    def flips(self, obs: Obs) -> Tensor:
+        """See `PairNet`. A flip moves the first layer's output along one column of its weights."""
+        b, n, m, f = obs.pairs.shape
+        every = torch.arange(n * m, device=obs.pairs.device)
+        inputs = obs.agents.shape[-1] + m * f + obs.peers.shape[2] * obs.peers.shape[3]
+        column = every // m * inputs + obs.agents.shape[-1] + every % m * f + f - 1
+        first, *rest = self.net
+        assert isinstance(first, nn.Linear)
+        change = (1 - 2 * obs.pairs[..., -1]).flatten(1)
+        before = first(_rows(obs).flatten(1))
+        values = before.unsqueeze(1) + change.unsqueeze(-1) * first.weight.T[column]
+        for layer in rest:
+            values = layer(values)
+        return values.sum(-1).view(b, n, m)
 
 
 class _PairBody(nn.Module):
@@ -158,7 +181,7 @@ class PairwiseCentral(nn.Module):
         return self.head(torch.cat((mine, mean), -1))
 
 
-class PairwisePairs(nn.Module):
+class PairwisePairs(PairNet):
     """Each pair's embedding with its agent's pool and its target's pool -> (B, N, M, out)."""
 
     def __init__(self, sizes: Sizes, hidden: int, out: int) -> None:
@@ -174,13 +197,33 @@ class PairwisePairs(nn.Module):
         context = self.row(_pool(e, 2)).unsqueeze(2) + self.column(_pool(e, 1)).unsqueeze(1)
         return self.head((self.own(e) + context).relu_())
 
+    def flips(self, obs: Obs) -> Tensor:
+        """See `PairNet`. A flip changes its own embedding, hence the pools of its row and its column, and no others."""
+        last = obs.pairs[..., -1:]
+        other = obs._replace(pairs=torch.cat((obs.pairs[..., :-1], 1 - last), -1))
+        e, new = self.pairs(obs), self.pairs(other)
+        own, row, column = self.own(e), self.row(_pool(e, 2)), self.column(_pool(e, 1))
+        new_row, new_column = self.row(_repool(e, new, 2)), self.column(_repool(e, new, 1))  # (B, N, M, H)
+        before = self._score(own + row.unsqueeze(2) + column.unsqueeze(1))
+        # Of pair (i, j) when (i, k) flips, and when (k, j) does.
+        in_row = self._score((own + column.unsqueeze(1)).unsqueeze(3) + new_row.unsqueeze(2))  # (B, N, M, k)
+        in_column = self._score((own + row.unsqueeze(2)).unsqueeze(2) + new_column.unsqueeze(1))  # (B, N, k, M)
+        at = self._score(self.own(new) + new_row + new_column)
+        n, m = before.shape[1:]
+        in_row = (in_row - before.unsqueeze(3)) * (1 - torch.eye(m, device=e.device)).view(1, 1, m, m)
+        in_column = (in_column - before.unsqueeze(2)) * (1 - torch.eye(n, device=e.device)).view(1, n, n, 1)
+        return before.sum((1, 2)).view(-1, 1, 1) + in_row.sum(2) + in_column.sum(1) + at - before
+
+    def _score(self, hidden: Tensor) -> Tensor:
+        return self.head(hidden.relu_()).squeeze(-1)
+
 
 class Encoder(NamedTuple):
     """The three shapes of one encoder."""
 
     local: Callable[..., nn.Module]
     central: Callable[..., nn.Module]
-    pairs: Callable[..., nn.Module]
+    pairs: Callable[..., PairNet]
 
 
 ENCODERS: dict[str, Encoder] = {
@@ -191,6 +234,18 @@ ENCODERS: dict[str, Encoder] = {
 
 def _pool(h: Tensor, dim: int) -> Tensor:
     return torch.cat((h.mean(dim), h.amax(dim)), -1)
+
+
+def _repool(h: Tensor, new: Tensor, dim: int) -> Tensor:
+    """`_pool` over `dim` with one entry replaced by its new value, for every entry: (B, N, M, H) -> (B, N, M, 2 H)."""
+    mean = h.mean(dim, keepdim=True) + (new - h) / h.shape[dim]
+    parts = h.unbind(dim)
+    below, above = [new.select(dim, 0)], [new.select(dim, -1)]  # largest of the new entry and those before, behind it
+    for k in range(1, len(parts)):
+        below.append(torch.maximum(parts[k - 1], below[-1]) if k > 1 else parts[0])
+        above.append(torch.maximum(parts[-k], above[-1]) if k > 1 else parts[-1])
+    largest = torch.stack(below, dim).maximum(torch.stack(above[::-1], dim)).maximum(new)
+    return torch.cat((mean, largest), -1)
 
 
 def _row(sizes: Sizes) -> int:

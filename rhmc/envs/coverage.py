@@ -79,7 +79,7 @@ class State(NamedTuple):
     targets: Tensor  # (B, M, 2)
     goal: Tensor  # (B, M, 2)
     speed: Tensor  # (B, M)
-    count: Tensor  # (B, M) moves towards the present goal
+    trip: Tensor  # (B, M) moves towards the present goal
     last: Tensor  # (B, M, 2) position before the last move
     before_last: Tensor  # (B, M, 2)
     moved: Tensor  # (B, M) bool, has moved since the reset
@@ -128,12 +128,12 @@ def move_targets(dt: float, state: State, rng: Generator) -> State:
     draw = torch.rand(*shape, 4, generator=rng, device=dev)
     gap = torch.minimum(_norm(state.targets - state.last), _norm(state.targets - state.before_last))
     gap = torch.where(state.moved, gap, FIRST_MOVE)
-    count = state.count + 1
-    redraw = (_norm(state.goal - state.targets) < GOAL_RADIUS) | (gap < STUCK) | (count > PATIENCE)
+    trip = state.trip + 1
+    redraw = (_norm(state.goal - state.targets) < GOAL_RADIUS) | (gap < STUCK) | (trip > PATIENCE)
     new_goal, new_speed = _goal_speed(draw)
     goal = torch.where(redraw.unsqueeze(-1), new_goal, state.goal)
     speed = torch.where(redraw, new_speed, state.speed)
-    count = torch.where(redraw, 0.0, count)
+    trip = torch.where(redraw, 0.0, trip)
     targets = state.targets + _displacement(state.targets, goal, speed, draw[..., 3], dt)
     before_last = state.last
     for _ in range(REDRAWS):  # few rows: work on them alone
@@ -142,7 +142,7 @@ def move_targets(dt: float, state: State, rng: Generator) -> State:
             break
         draw = torch.rand(len(rows[0]), 4, generator=rng, device=dev)
         goal[rows], speed[rows] = _goal_speed(draw)
-        count[rows] = 0
+        trip[rows] = 0
         stay = state.targets[rows]
         targets[rows] = stay + _displacement(stay, goal[rows], speed[rows], draw[..., 3], dt)
         before_last = before_last.index_put(rows, stay)
@@ -152,7 +152,7 @@ def move_targets(dt: float, state: State, rng: Generator) -> State:
         targets=targets,
         goal=goal,
         speed=speed,
-        count=count,
+        trip=trip,
         last=state.targets,
         before_last=before_last,
         moved=torch.ones_like(state.moved),

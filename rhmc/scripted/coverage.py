@@ -14,7 +14,8 @@ from rhmc.scripted.joint import best_choice, largest_union
 
 HORIZON = 30  # steps the planner looks ahead
 PASSES = 2  # rounds in which each sensor's plan is improved, the others' held fixed
-IDLE = 1e-3  # what the planner gives, in targets, for a step without a turn: decides ties only
+IDLE = 0.01  # what the planner gives, in targets, for a step without a turn (the price of one in local rewards)
+CENTRE = 0.001  # and for a sighting on the axis rather than far off it: a tie, where a target that turns is kept longer
 
 
 def random(cfg: Config, state: State, rng: Generator) -> Tensor:
@@ -81,16 +82,16 @@ def planner(cfg: Config, state: State, rng: Generator) -> Tensor:
     """
     sight = _sight(state)
     batch, horizon, targets, _ = sight[0].shape
-    plans = torch.zeros(batch, cfg.agents, horizon, targets, device=state.heading.device)
+    plans = torch.zeros(batch, cfg.agents, horizon, targets, dtype=torch.bool, device=state.heading.device)
     action = torch.zeros_like(state.heading, dtype=torch.int64)
     for i in [*range(cfg.agents)] * PASSES:
-        plans[:, i] = 0
-        unseen = 1 - plans.amax(1)
+        plans[:, i] = False
+        unseen = (~plans.any(1)).float()
         gain = (unseen.unsqueeze(-2) @ sight[i]).squeeze(-2)
         offset = _best_path(gain)
         action[:, i] = toward(TURN * (offset[:, 0] - horizon))
         column = offset.view(batch, horizon, 1, 1).expand(-1, -1, targets, 1)
-        plans[:, i] = sight[i].gather(-1, column).squeeze(-1)
+        plans[:, i] = sight[i].gather(-1, column).squeeze(-1) > 0
     return action
 
 
@@ -131,7 +132,10 @@ def windows(bearing: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _sight(state: State) -> list[Tensor]:
-    """What a sensor would see 1 to T steps ahead, turned by -T to T actions: N times (B, T, M, 2T + 1), 0 or 1."""
+    """What a sensor would see 1 to T steps ahead, turned by -T to T actions: N times (B, T, M, 2T + 1).
+
+    0 is out of sight, about 1 in sight: a little more near the axis, where a target that turns is not lost at once.
+    """
     steps = torch.arange(1, HORIZON + 1, device=state.heading.device).view(1, -1, 1, 1)
     ahead = state.targets.unsqueeze(1) + steps * (state.targets - state.last).unsqueeze(1)
     later = state._replace(targets=ahead.clamp(-HALF_AREA, HALF_AREA).flatten(1, 2))
@@ -140,7 +144,11 @@ def _sight(state: State) -> list[Tensor]:
     angle = torch.deg2rad(bearing)
     ray = torch.stack((angle.cos(), angle.sin()), -1) * (distance <= RANGE).unsqueeze(-1)
     axes, edge = torch.stack((turned.cos(), turned.sin())), math.cos(math.radians(HALF_VIEW))
-    return [(own @ axes > edge).float() for own in ray.unbind(1)]  # the cosine off axis, 0 out of range
+    return [_worth(own @ axes, edge) for own in ray.unbind(1)]  # of the cosine of the angle off axis, 0 out of range
+
+
+def _worth(cosine: Tensor, edge: float) -> Tensor:
+    return torch.where(cosine > edge, 1 - CENTRE * (1 - cosine), 0.0)
 
 
 def _best_path(gain: Tensor) -> Tensor:

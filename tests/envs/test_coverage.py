@@ -67,7 +67,7 @@ def target_of(state: State, b: int, j: int) -> oracle.Target:
 
     visited = [point(state.before_last), point(state.last)] if state.moved[b, j] else []
     return oracle.Target(
-        point(state.targets), point(state.goal), float(state.speed[b, j]), int(state.count[b, j]), visited
+        point(state.targets), point(state.goal), float(state.speed[b, j]), int(state.trip[b, j]), visited
     )
 
 
@@ -98,7 +98,7 @@ def assert_same(state: State, worlds: list[oracle.World], atol: float) -> None:
             assert seen.goal[b, j].tolist() == pytest.approx(target.goal, abs=1e-4)
             assert seen.last[b, j].tolist() == pytest.approx(target.visited[-1], abs=atol)
             assert seen.speed[b, j] == target.speed
-            assert seen.count[b, j] == target.counter
+            assert seen.trip[b, j] == target.counter
 
 
 def per_pair(worlds: list[oracle.World], value: Any) -> Tensor:
@@ -214,8 +214,10 @@ def test_options_are_what_turning_step_by_step_would_show(seed: int, n: int, hor
     state = double(played(cfg, WORLDS, rng, 2))
     options = coverage.options(cfg, state, horizon)
     assert options.shape == (WORLDS, n, 2 * horizon + 1, cfg.targets)
+    carried_on = state.targets + horizon * (state.targets - state.last)
+    ahead = state._replace(targets=carried_on.clamp(-1250, 1250))
     for action, sign in ((1, 1), (2, -1)):
-        worlds = worlds_of(state)
+        worlds = worlds_of(ahead)
         for turned in range(horizon + 1):
             expected = per_pair(worlds, oracle.World.sees)
             assert torch.equal(options[:, :, horizon + sign * turned].double(), expected)
@@ -292,17 +294,17 @@ def test_actions_turn_five_degrees_left_or_right_and_wrap() -> None:
         ({"before_last": (0.0, 9.9)}, True),
         ({"last": (10.1, 0.0), "before_last": (0.0, 10.1)}, False),
         ({"last": (0.0, 0.0), "before_last": (0.0, 0.0), "moved": False}, False),
-        ({"count": 99.0}, False),
-        ({"count": 100.0}, True),
+        ({"trip": 99.0}, False),
+        ({"trip": 100.0}, True),
     ],
 )
 def test_when_a_target_changes_its_mind(change: dict[str, Any], redrawn: bool) -> None:
     state = still(sensors=[(0.0, 0.0)], headings=[0.0], targets=[(0.0, 0.0)])
-    fields = {"goal": (500.0, 0.0), "last": (-20.0, 0.0), "before_last": (-40.0, 0.0), "moved": True, "count": 7.0}
+    fields = {"goal": (500.0, 0.0), "last": (-20.0, 0.0), "before_last": (-40.0, 0.0), "moved": True, "trip": 7.0}
     state = state._replace(**{k: torch.tensor(v).expand(getattr(state, k).shape) for k, v in (fields | change).items()})
     after = coverage.move_targets(0.3, state, generator(3))
     assert (not torch.equal(after.goal, state.goal)) is redrawn
-    assert after.count.item() == (0 if redrawn else state.count.item() + 1)
+    assert after.trip.item() == (0 if redrawn else state.trip.item() + 1)
     step = torch.linalg.vector_norm(after.targets).item()
     assert 0.3 * after.speed.item() <= step < 0.3 * 1.2 * after.speed.item()
 
@@ -314,7 +316,7 @@ def test_a_target_that_would_leave_decides_again_from_where_it_is() -> None:
     after = coverage.move_targets(0.3, state, generator(0))
     assert after.targets.abs().max() <= 1250
     assert after.goal[0, 0, 0] < 1249
-    assert after.count.item() == 0
+    assert after.trip.item() == 0
     assert torch.equal(after.last, state.targets)
     assert torch.equal(after.before_last, state.targets)
     assert state.goal[0, 0].tolist() == [1260.0, 0.0], "the old state was changed in place"

@@ -1,0 +1,337 @@
+"""A YAML document as a tree that knows where each value was written, so that every fault can name its place.
+
+Plain YAML 1.2 (`off` is text, `5e-4` a number) without aliases and tags. Overrides from the command line are small
+trees of the same kind. Nothing here knows what a study is.
+"""
+
+import difflib
+import enum
+import json
+import math
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+from ruamel.yaml import YAML
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.nodes import MappingNode, ScalarNode
+from ruamel.yaml.nodes import Node as YamlNode
+
+LIMIT = 1_000_000  # bytes; larger is no study
+EXACT = 2**53  # floats below it that are whole numbers are read as integers: 5e6 is a number of steps
+SHOWN = 60  # characters of an offending value
+PLAIN_TAGS = ("tag:yaml.org,2002:map", "tag:yaml.org,2002:seq")
+
+M = TypeVar("M", bound=BaseModel)
+
+
+class Unreadable(enum.Enum):
+    """Stands for a value that is a fault already, so that nothing else is said about it."""
+
+    VALUE = enum.auto()
+
+
+class Place(NamedTuple):
+    """Where something was written: a file with line and column (from 1), or the override itself."""
+
+    source: str
+    line: int = 0
+    column: int = 0
+
+    def __str__(self) -> str:
+        return f"{self.source}:{self.line}:{self.column}" if self.line else self.source
+
+
+class Fault(NamedTuple):
+    """One thing that is wrong."""
+
+    place: Place
+    path: str
+    text: str
+
+    def __str__(self) -> str:
+        return ": ".join(part for part in (str(self.place), self.path, self.text) if part)
+
+
+class Node(NamedTuple):
+    """A value, where it and its key were written, and its dotted path there (an override's: in the file's terms)."""
+
+    value: "str | int | float | bool | dict[str, Node] | list[Node] | Unreadable | None"
+    place: Place
+    key: Place
+    path: str
+
+    @property
+    def children(self) -> "dict[str, Node]":
+        """Children by key; empty for anything but a mapping."""
+        return self.value if isinstance(self.value, dict) else {}
+
+
+# Reading
+
+
+def read(path: Path) -> tuple[Node | None, list[Fault]]:
+    """The document in a file, and what is wrong with it as YAML. No document means that nothing could be read."""
+    source = str(path)
+    try:
+        with path.open("rb") as file:
+            data = file.read(LIMIT + 1)
+    except OSError as error:
+        return None, [Fault(Place(source), "", _unreadable(path, error))]
+    if len(data) > LIMIT:
+        return None, [Fault(Place(source), "", f"larger than {LIMIT} bytes; a study is a short text")]
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        before = data[: error.start].split(b"\n")
+        place = Place(source, len(before), len(before[-1].decode("utf-8", "replace")) + 1)
+        return None, [Fault(place, "", f"byte 0x{data[error.start]:02x} is not UTF-8; save the file as UTF-8")]
+    return _Reader(source, marks=True).read(text, "")
+
+
+def override(text: str, path: str, value: str) -> tuple[Node | None, list[Fault]]:
+    """The value of an override, read as YAML. `text` is how the override is named in faults."""
+    return _Reader(text, marks=False).read(value, path)
+
+
+def _unreadable(path: Path, error: OSError) -> str:
+    if path.is_dir():
+        found = sorted(p.name for p in path.glob("*.yaml"))
+        return "a directory; give one study" + (f" of it: {', '.join(found)}" if found else "")
+    if isinstance(error, FileNotFoundError):
+        near = [str(p) for folder in (path.parent, Path("studies")) for p in sorted(folder.glob("*.yaml"))]
+        return "no such file" + nearest(str(path), near)
+    return error.strerror or str(error)
+
+
+class _Reader:
+    """Builds the tree from YAML nodes and collects the faults."""
+
+    def __init__(self, source: str, *, marks: bool) -> None:
+        self.source, self.marks = source, marks
+        self.faults: list[Fault] = []
+        self.seen: set[int] = set()
+        self.yaml = YAML(typ="safe", pure=True)
+
+    def read(self, text: str, path: str) -> tuple[Node | None, list[Fault]]:
+        try:
+            node = self.yaml.compose(text)
+            root = self._build(node, path, self._place(node)) if node is not None else None
+        except MarkedYAMLError as error:
+            return None, [*self.faults, Fault(self._place(error), path, _syntax(error))]
+        except YAMLError as error:
+            return None, [*self.faults, Fault(Place(self.source), path, f"not YAML: {str(error).splitlines()[0]}")]
+        except RecursionError:
+            return None, [*self.faults, Fault(Place(self.source), path, "nested too deeply to be a study")]
+        return root, self.faults
+
+    def _place(self, node: Any) -> Place:
+        mark = getattr(node, "problem_mark", None) or getattr(node, "start_mark", None)
+        return Place(self.source, mark.line + 1, mark.column + 1) if mark and self.marks else Place(self.source)
+
+    def _fault(self, node: YamlNode, path: str, text: str) -> None:
+        self.faults.append(Fault(self._place(node), path, text))
+
+    def _build(self, node: YamlNode, path: str, key: Place) -> Node:
+        value: Any = Unreadable.VALUE
+        alias = id(node) in self.seen
+        self.seen.add(id(node))
+        if alias:
+            text = "used again by an alias; aliases are not read here, write the value out"
+            self.faults.append(Fault(key, path, text))  # the node's own place is that of its first use
+        elif isinstance(node, ScalarNode):
+            value = self._scalar(node, path)
+        elif str(node.tag) not in PLAIN_TAGS:
+            self._fault(node, path, f"the tag {node.tag} is not read here")
+        else:
+            value = self._mapping(node, path) if isinstance(node, MappingNode) else self._sequence(node, path)
+        return Node(value, self._place(node), key, path)
+
+    def _mapping(self, node: MappingNode, path: str) -> dict[str, Node]:
+        children: dict[str, Node] = {}
+        for key, child in node.value:
+            if not isinstance(key, ScalarNode):
+                self._fault(key, path, "a key must be a word, not a list or a mapping")
+                continue
+            name, place = str(key.value), self._place(key)
+            built = self._build(child, join(path, name), place)
+            if name in children:
+                first = children[name].key
+                where = f"first in line {first.line}" if first.line else "already given"
+                self._fault(key, built.path, f"duplicate key {show(name)}, {where}")
+            else:
+                children[name] = built
+        return children
+
+    def _sequence(self, node: YamlNode, path: str) -> list[Node]:
+        return [self._build(child, join(path, str(i)), self._place(child)) for i, child in enumerate(node.value)]
+
+    def _scalar(self, node: ScalarNode, path: str) -> str | int | float | bool | Unreadable | None:
+        try:
+            value = self.yaml.constructor.construct_object(node)
+        except (YAMLError, ValueError):
+            self._fault(node, path, f"{show(node.value)} cannot be read as {str(node.tag).rsplit(':', 1)[-1]}")
+            return Unreadable.VALUE
+        if isinstance(value, float) and not math.isfinite(value):
+            self._fault(node, path, f"{node.value} is not allowed; must be a finite number")
+            return Unreadable.VALUE
+        if isinstance(value, float) and value.is_integer() and abs(value) < EXACT:
+            return int(value)
+        if isinstance(value, str) and not value.isprintable():
+            return "".join(c if c.isprintable() or c == "\n" else "\N{REPLACEMENT CHARACTER}" for c in value)
+        if value is not None and not isinstance(value, str | int | float):
+            self._fault(node, path, f"{node.value} is read as a {type(value).__name__}; in quotes it is text")
+            return Unreadable.VALUE
+        return value
+
+
+def _syntax(error: MarkedYAMLError) -> str:
+    problem = (error.problem or "cannot be read").replace("\\t", "TAB")
+    if "TAB" in problem:
+        return "not YAML: a TAB; indent with spaces"
+    return f"not YAML: {problem}" + (f" ({error.context})" if error.context else "")
+
+
+# Trees
+
+
+def join(path: str, name: str) -> str:
+    """Dotted path of a child."""
+    return f"{path}.{name}" if path else name
+
+
+def plain(node: Node) -> Any:
+    """The value without places."""
+    if isinstance(node.value, dict):
+        return {key: plain(child) for key, child in node.value.items()}
+    if isinstance(node.value, list):
+        return [plain(child) for child in node.value]
+    return None if isinstance(node.value, Unreadable) else node.value
+
+
+def merge(base: Node, patch: Node) -> Node:
+    """`patch` over `base`: mappings key by key, anything else is replaced.
+
+    A mapping whose `kind` differs from the base's replaces it whole: the base's other fields belong to another thing.
+    """
+    if not isinstance(base.value, dict) or not isinstance(patch.value, dict) or _other_kind(base, patch):
+        return patch
+    value = dict(base.value)
+    for key, child in patch.value.items():
+        value[key] = merge(value[key], child) if key in value else child
+    return base._replace(value=value)
+
+
+def _other_kind(base: Node, patch: Node) -> bool:
+    kinds = [node.children["kind"].value for node in (base, patch) if "kind" in node.children]
+    return len(kinds) == 2 and kinds[0] != kinds[1]
+
+
+def locate(node: Node, loc: Iterable[str | int]) -> tuple[Node, list[str]]:
+    """The deepest written node on the way along `loc`, and the part of the way that is not written."""
+    rest = [str(part) for part in loc]
+    while rest:
+        children = dict(enumerate_(node))
+        if rest[0] not in children:
+            break
+        node = children[rest.pop(0)]
+    return node, rest
+
+
+def enumerate_(node: Node) -> Iterator[tuple[str, Node]]:
+    """Children of a mapping or a list by the text of their key or index."""
+    if isinstance(node.value, list):
+        yield from ((str(i), child) for i, child in enumerate(node.value))
+    yield from node.children.items()
+
+
+# Validation
+
+
+def validate(model: type[M], node: Node, hidden: tuple[str, ...] = ()) -> tuple[M | None, list[Fault]]:
+    """The tree as a model, or every fault. Fields in `hidden` are not offered to the user.
+
+    Strict: no text for a number, no `true` for 1.
+    """
+    try:
+        return model.model_validate_json(json.dumps(plain(node)), strict=True), []
+    except ValidationError as error:
+        faults = [_fault(model, node, detail, hidden) for detail in error.errors()]
+        return None, [fault for fault in faults if fault]
+
+
+def _fault(model: type[BaseModel], root: Node, error: ErrorDetails, hidden: tuple[str, ...]) -> Fault | None:
+    loc, kind, context = [str(part) for part in error["loc"]], error["type"], error.get("ctx", {})
+    text = str(context.get("error", ""))
+    if kind == "value_error":  # a rule across fields: 'field: text' names the field it is about
+        field, colon, tail = text.partition(": ")
+        loc, text = ([*loc, field], tail) if colon and field in model.model_fields else (loc, text)
+    node, rest = locate(root, loc)
+    path = ".".join(part for part in (node.path, *rest) if part)
+    if isinstance(node.value, Unreadable):
+        return None
+    if kind == "value_error":
+        return Fault(node.place, path, text)
+    if kind == "missing":
+        return Fault(node.key, path, "missing")
+    if kind == "extra_forbidden":
+        allowed = [name for name in _fields(model, error["loc"][:-1]) if name not in hidden]
+        return Fault(node.key, path, f"unknown key {show(loc[-1])}; {choices(loc[-1], allowed)}")
+    return Fault(node.place, path, f"{show(node.value)} is not allowed; {_rule(node, error)}")
+
+
+def _rule(node: Node, error: ErrorDetails) -> str:
+    """What is allowed instead of the node's value."""
+    context = error.get("ctx", {})
+    if error["type"] == "literal_error":
+        allowed = context["expected"].replace(" or ", ", ").split(",")
+        return choices(node.value, [name.strip().strip("'") for name in allowed])
+    if context.get("min_length") == 1:
+        return "must not be empty"
+    rule = error["msg"].replace("Input should be", "must be").replace("an object", "a mapping").replace("array", "list")
+    return rule[0].lower() + rule[1:]
+
+
+def _fields(model: type[BaseModel], loc: tuple[str | int, ...]) -> list[str]:
+    """Names of the fields of the model at `loc` inside `model`; names of free keys are passed over."""
+    for part in loc:
+        if str(part) in model.model_fields:
+            model = _inner(model.model_fields[str(part)].annotation) or model
+    return list(model.model_fields)
+
+
+def _inner(annotation: Any) -> type[BaseModel] | None:
+    """The model in an annotation such as `Layer`, `Layer | None` or `dict[str, Layer]`."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    found = [_inner(part) for part in getattr(annotation, "__args__", ())]
+    return next((model for model in found if model), None)
+
+
+# Words
+
+
+def show(value: Any) -> str:
+    """A value as a person would write it in YAML, cut to `SHOWN` characters."""
+    if isinstance(value, str):
+        text = f"'{value}'" if value.isprintable() else repr(value)
+    elif isinstance(value, dict | list):
+        text = json.dumps(plain(Node(value, Place(""), Place(""), "")), ensure_ascii=False)
+    else:
+        text = json.dumps(value)
+    return text if len(text) <= SHOWN else text[: SHOWN - 1] + "…"
+
+
+def choices(value: Any, allowed: Iterable[str]) -> str:
+    """What is allowed instead, and the nearest of it."""
+    names = list(allowed)
+    return f"allowed: {', '.join(names)}{nearest(str(value), names)}"
+
+
+def nearest(word: str, names: Iterable[str]) -> str:
+    """'; did you mean ...?' where something is near, else nothing."""
+    by_lower = {name.lower(): name for name in names}
+    found = difflib.get_close_matches(word.lower(), by_lower, n=1, cutoff=0.5)
+    return f"; did you mean '{by_lower[found[0]]}'?" if found else ""

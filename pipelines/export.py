@@ -1,0 +1,121 @@
+"""From the log to two small files per study: all that the reports read.
+
+The files are canonical: the same log gives the same bytes (sorted rows, no clock, no names that the log made up).
+"""
+
+import os
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from pipelines.fingerprint import fingerprint
+from pipelines.plan import Item, items, study_card
+from pipelines.store import Home, StoreError, work_folder
+from pipelines.study import Study
+from pipelines.tracker import Recorded, Row, Tracker
+
+METRICS = pa.schema(
+    [
+        ("study", pa.string()),
+        ("arm", pa.string()),
+        ("seed", pa.int64()),
+        ("run", pa.string()),  # spec id
+        ("step", pa.int64()),
+        ("metric", pa.string()),
+        ("value", pa.float64()),
+    ]
+)
+RUNS = pa.schema(
+    [
+        ("study", pa.string()),
+        ("arm", pa.string()),
+        ("seed", pa.int64()),
+        ("run", pa.string()),
+        ("status", pa.string()),  # finished, partial or missing
+        ("algorithm", pa.string()),
+        ("task", pa.string()),
+        ("profile", pa.string()),
+        ("config", pa.string()),  # the spec as canonical JSON
+        ("fingerprint", pa.string()),
+        ("commit", pa.string()),
+        ("question", pa.string()),
+        ("seconds", pa.float64()),  # spent training
+    ]
+)
+
+
+def export_study(study: Study, out: Path, home: Path | None = None) -> int:
+    """Write `<out>/<study>.parquet` (schema `METRICS`) and `<out>/<study>.runs.parquet` (schema `RUNS`).
+
+    Only runs of the present plan and code are taken; `time/` metrics stay behind, but for the seconds of a run.
+
+    Args:
+        study: the plan.
+        out: folder, made when missing.
+        home: work folder, see `work_folder`.
+
+    Returns:
+        0 all planned runs are there and finished, 1 some are not (the files are written all the same), 2 something is
+        in the way.
+    """
+    from pipelines.mlflow_tracker import open_existing
+
+    try:
+        tracker = open_existing(study_card(study), Home(home or work_folder()))
+        plan = items(study, fingerprint(), "")
+        unfinished = write_tables(study, plan, tracker, out)
+    except StoreError as error:
+        print(f"rhmc: {error}", file=sys.stderr)
+        return 2
+    if unfinished:
+        print(f"{study.name} ({study.profile}): {unfinished} of {len(plan)} runs are not finished", file=sys.stderr)
+    return 1 if unfinished else 0
+
+
+def write_tables(study: Study, plan: list[Item], tracker: Tracker | None, out: Path) -> int:
+    """Write both files and return how many planned runs are not finished."""
+    found = {(run.arm, run.key): run for run in tracker.recorded()} if tracker else {}
+    there = [(item, found.get((item.card.arm, item.key))) for item in plan]
+    refs = [run.ref for _, run in there if run]
+    by_ref: dict[str, list[Row]] = {ref: [] for ref in refs}
+    for row in tracker.rows(refs) if tracker else []:
+        by_ref[row.ref].append(row)
+    values, runs = [], []
+    for item, run in there:
+        rows = by_ref[run.ref] if run else []
+        place = (study.name, item.card.arm, item.card.seed, item.card.spec_id)
+        values += [(*place, r.step, r.metric, r.value) for r in rows if not r.metric.startswith("time/")]
+        runs.append((*place, *_about(study, item, run, rows)))
+    write_parquet(out / f"{study.name}.parquet", METRICS, sorted(values, key=lambda row: row[:6]))
+    write_parquet(out / f"{study.name}.runs.parquet", RUNS, sorted(runs, key=lambda row: row[:4]))
+    return sum(1 for _, run in there if run is None or run.status != "finished")
+
+
+def _about(study: Study, item: Item, run: Recorded | None, rows: list[Row]) -> tuple[str | float, ...]:
+    status = "missing" if run is None else "finished" if run.status == "finished" else "partial"
+    seconds = max((row.value for row in rows if row.metric == "time/seconds"), default=0.0)
+    card, commit = item.card, run.commit if run else ""
+    names = (status, card.algorithm, card.task, study.profile, item.spec.canonical(), card.fingerprint, commit)
+    return (*names, study.question, seconds)
+
+
+def write_parquet(path: Path, schema: pa.Schema, rows: list[tuple[object, ...]]) -> None:
+    """Write rows in the given order, whole or not at all.
+
+    Raises:
+        StoreError: the folder cannot be written to, or the disk is full.
+    """
+    columns = list(zip(*rows, strict=True)) or [()] * len(schema)
+    table = pa.table([pa.array(column, field.type) for column, field in zip(columns, schema, strict=True)], schema)
+    part = path.with_suffix(f".{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(table, part, compression="zstd", version="2.6", row_group_size=2**20)
+        part.replace(path)
+    except OSError as error:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+        raise StoreError(f"{path}: cannot be written: {error.strerror or error}") from error

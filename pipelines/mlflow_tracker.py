@@ -1,0 +1,329 @@
+"""The log on MLflow, the only module that talks to it.
+
+One experiment per study and profile, in it one parent run for the study and one nested run per arm and key.
+"""
+
+import logging
+import os
+import sqlite3
+import time
+import urllib.error
+import urllib.request
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock
+
+from pipelines.store import Home, StoreError, one_line
+from pipelines.tracker import Card, Recorded, Row, Status, StudyCard, unseen
+from rhmc.types import Metrics
+
+os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "3")
+
+from mlflow import MlflowClient
+from mlflow.entities import Metric, Param, Run, RunTag, ViewType
+from mlflow.exceptions import MlflowException
+from sqlalchemy.exc import SQLAlchemyError
+
+STATUS: dict[Status, str] = {
+    "running": "RUNNING",
+    "finished": "FINISHED",
+    "failed": "FAILED",
+    "interrupted": "KILLED",
+}
+FROM_MLFLOW: dict[str, Status] = {theirs: ours for ours, theirs in STATUS.items()}
+BATCH = 1000  # values that one request may carry
+PARENT = "study"  # tag `role` of the parent run; its runs have `run`
+
+
+def tracking_uri(home: Home) -> str:
+    """`$MLFLOW_TRACKING_URI`, or SQLite in the work folder."""
+    return os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{home.database}"
+
+
+def experiment_name(study: StudyCard) -> str:
+    """The experiment of a study and profile."""
+    return f"{study.study} ({study.profile})"
+
+
+class MlflowTracker:
+    """See `Tracker`.
+
+    Args:
+        study: what is logged.
+        home: the work folder.
+        write: make the experiment and its parent run when they are missing, and mark runs that a killed driver left
+            running as interrupted. The caller holds the study's lock.
+
+    Raises:
+        StoreError: the store cannot be reached, or is not MLflow's. All other methods raise it as well.
+    """
+
+    def __init__(self, study: StudyCard, home: Home, *, write: bool = True) -> None:
+        self.study, self.uri = study, tracking_uri(home)
+        check(self.uri)
+        quieten()
+        with explained(self.uri):
+            if self.uri.startswith("sqlite:"):
+                create_database(sqlite_file(self.uri))
+            self.client = MlflowClient(self.uri, self.uri)
+            self.experiment = self._experiment(home, write)
+            self.parent = self._parent() if write else None
+            if write:
+                self._interrupt_running()
+
+    def _experiment(self, home: Home, write: bool) -> str | None:
+        name = experiment_name(self.study)
+        found = self.client.get_experiment_by_name(name)
+        if found is None and write:
+            local = self.uri.startswith("sqlite:")
+            return self.client.create_experiment(name, home.artifacts.as_uri() if local else None)
+        if found is not None and found.lifecycle_stage != "active":
+            if not write:
+                return None
+            self.client.restore_experiment(found.experiment_id)
+        return found.experiment_id if found else None
+
+    def _parent(self) -> str:
+        runs = self._search("tags.role = 'study'")
+        ref = runs[0].info.run_id if runs else self._create(self.study.study, {"role": PARENT}).info.run_id
+        self.client.set_tag(ref, "mlflow.note.content", self.study.note)
+        self.client.update_run(ref, "RUNNING")
+        return ref
+
+    def _create(self, name: str, tags: dict[str, str]) -> Run:
+        tags = tags | {"study": self.study.study, "profile": self.study.profile}
+        assert self.experiment is not None
+        return self.client.create_run(self.experiment, run_name=name, tags=tags)
+
+    def _search(self, query: str, experiments: list[str] | None = None) -> list[Run]:
+        """All runs that match, oldest first."""
+        where = experiments or ([self.experiment] if self.experiment else [])
+        runs: list[Run] = []
+        page: str | None = None
+        while where:
+            found = self.client.search_runs(where, query, ViewType.ACTIVE_ONLY, 1000, ["attributes.start_time"], page)
+            runs += found
+            page = found.token
+            if not page:
+                break
+        return runs
+
+    def _interrupt_running(self) -> None:
+        for run in self._search("tags.role = 'run' and attributes.status = 'RUNNING'"):
+            self.client.set_terminated(run.info.run_id, STATUS["interrupted"])
+
+    def recorded(self) -> list[Recorded]:
+        """See `Tracker`."""
+        with explained(self.uri):
+            return [_recorded(run) for run in self._search("tags.role = 'run'")]
+
+    def finished_anywhere(self, fingerprint: str) -> dict[str, str]:
+        """See `Tracker`."""
+        query = f"tags.role = 'run' and tags.fingerprint = '{fingerprint}' and attributes.status = 'FINISHED'"
+        with explained(self.uri):
+            everywhere = [e.experiment_id for e in self.client.search_experiments(max_results=1000)]
+            runs = self._search(query, everywhere)
+        return {_recorded(run).key: run.info.run_id for run in reversed(runs)}
+
+    def start(self, card: Card) -> "MlflowRun":
+        """See `Tracker`."""
+        query = f"tags.role = 'run' and tags.spec = '{card.spec_id}' and tags.fingerprint = '{card.fingerprint}'"
+        with explained(self.uri):
+            for run in self._search(query):
+                if run.data.tags["variant"] == card.arm:
+                    self._reopen(run)
+                    seen = {(row.metric, row.step) for row in self.rows([run.info.run_id])}
+                    return MlflowRun(self.client, self.uri, run.info.run_id, seen)
+            run = self._create(f"{card.arm} s{card.seed}", self._tags(card))
+            self.client.log_batch(run.info.run_id, params=[Param(k, v) for k, v in card.params.items()])
+        return MlflowRun(self.client, self.uri, run.info.run_id, set())
+
+    def _reopen(self, run: Run) -> None:
+        self.client.update_run(run.info.run_id, "RUNNING")
+        if "error" in run.data.tags:
+            self.client.delete_tag(run.info.run_id, "error")
+
+    def _tags(self, card: Card) -> dict[str, str]:
+        return {
+            "role": "run",
+            "mlflow.parentRunId": self.parent or "",
+            "variant": card.arm,
+            "algorithm": card.algorithm,
+            "task": card.task,
+            "seed": str(card.seed),
+            "spec": card.spec_id,
+            "fingerprint": card.fingerprint,
+            "commit": card.commit,
+        }
+
+    def rows(self, refs: Sequence[str]) -> list[Row]:
+        """See `Tracker`. One query where the store is SQLite, else a request per run and metric."""
+        with explained(self.uri):
+            found = self._rows_sqlite(refs) if self.uri.startswith("sqlite:") else self._rows_client(refs)
+        return sorted(found)
+
+    def _rows_client(self, refs: Sequence[str]) -> Iterator[Row]:
+        for ref in refs:
+            for metric in self.client.get_run(ref).data.metrics:
+                first: dict[int, float] = {}
+                for value in self.client.get_metric_history(ref, metric):
+                    first.setdefault(value.step, value.value)
+                yield from (Row(ref, step, metric, value) for step, value in first.items())
+
+    def _rows_sqlite(self, refs: Sequence[str]) -> Iterator[Row]:
+        """The client's answer, read from MLflow's table `metrics` at once."""
+        first: dict[tuple[str, int, str], float] = {}
+        query = "SELECT run_uuid, step, key, value, is_nan FROM metrics WHERE run_uuid = ? ORDER BY timestamp"
+        with closing(sqlite3.connect(f"file:{sqlite_file(self.uri)}?mode=ro", uri=True)) as database:
+            for ref in refs:
+                for run, step, metric, value, is_nan in database.execute(query, (ref,)):
+                    first.setdefault((run, step, metric), float("nan") if is_nan else value)
+        return (Row(*place, value) for place, value in first.items())
+
+    def close(self, status: Status) -> None:
+        """See `Tracker`."""
+        with explained(self.uri):
+            self._interrupt_running()
+            if self.parent:
+                self.client.set_terminated(self.parent, STATUS[status])
+
+    @property
+    def name(self) -> str:
+        """The experiment's name."""
+        return experiment_name(self.study)
+
+    def where(self) -> str:
+        """How to look at the experiment: a command, or a server's address."""
+        return self.uri if self.uri.startswith(("http://", "https://")) else "rhmc ui"
+
+
+class MlflowRun:
+    """See `RunLog`."""
+
+    def __init__(self, client: MlflowClient, uri: str, ref: str, seen: set[tuple[str, int]]) -> None:
+        self.client, self.uri, self.ref, self.seen = client, uri, ref, seen
+
+    def log(self, points: Sequence[Metrics]) -> None:
+        """See `RunLog`."""
+        now = int(time.time() * 1000)
+        values = [Metric(metric, value, now, step) for metric, step, value in unseen(points, self.seen)]
+        with explained(self.uri):
+            for start in range(0, len(values), BATCH):
+                self.client.log_batch(self.ref, metrics=values[start : start + BATCH])
+
+    def artifact(self, path: Path) -> None:
+        """See `RunLog`."""
+        with explained(self.uri):
+            self.client.log_artifact(self.ref, str(path))
+
+    def text(self, name: str, content: str) -> None:
+        """See `RunLog`."""
+        with explained(self.uri):
+            self.client.log_text(self.ref, content, name)
+
+    def tag(self, name: str, value: str) -> None:
+        """See `RunLog`."""
+        with explained(self.uri):
+            self.client.log_batch(self.ref, tags=[RunTag(name, value[:5000])])
+
+    def finish(self, status: Status) -> None:
+        """See `RunLog`."""
+        with explained(self.uri):
+            self.client.set_terminated(self.ref, STATUS[status])
+
+
+def open_existing(study: StudyCard, home: Home) -> MlflowTracker | None:
+    """The log for reading; None where there is no database yet (MLflow would make one)."""
+    uri = tracking_uri(home)
+    if uri.startswith("sqlite:") and not sqlite_file(uri).exists():
+        return None
+    return MlflowTracker(study, home, write=False)
+
+
+def _recorded(run: Run) -> Recorded:
+    tags: dict[str, str] = defaultdict(str, run.data.tags)
+    key = f"{tags['spec']}-{tags['fingerprint']}"
+    return Recorded(run.info.run_id, tags["variant"], key, FROM_MLFLOW[run.info.status], tags["commit"])
+
+
+# What may be in the way
+
+
+def quieten() -> None:
+    """Keep MLflow and its migrations from talking."""
+    for name in ("mlflow", "alembic"):
+        logging.getLogger(name).setLevel(logging.ERROR)
+
+
+def sqlite_file(uri: str) -> Path:
+    """The file of a `sqlite:///` address."""
+    return Path(uri.removeprefix("sqlite:///").split("?")[0])
+
+
+def check(uri: str) -> None:
+    """See early and cheaply that the store is one.
+
+    Raises:
+        StoreError: a file that is not MLflow's, or a server that does not answer.
+    """
+    if uri.startswith("sqlite:"):
+        _check_file(sqlite_file(uri))
+    elif uri.startswith(("http://", "https://")):
+        _check_server(uri)
+
+
+def _check_file(path: Path) -> None:
+    advice = "move it away, or name another store in MLFLOW_TRACKING_URI"
+    try:
+        if not path.exists() or path.stat().st_size == 0:
+            if not path.parent.is_dir():
+                raise StoreError(f"{path.parent}: no such folder (for the MLflow database)")
+            return
+        with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as database:
+            tables = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    except (sqlite3.Error, OSError) as error:
+        raise StoreError(f"{path}: not an MLflow database ({error}); {advice}") from error
+    if tables and not {"experiments", "runs", "metrics", "alembic_version"} <= tables:
+        raise StoreError(f"{path}: a database, but not MLflow's; {advice}")
+    if not os.access(path, os.W_OK):
+        raise StoreError(f"{path}: the MLflow database cannot be written to (read-only)")
+
+
+def create_database(path: Path) -> None:
+    """Make MLflow's database where there is none. It takes seconds: whoever dies meanwhile leaves none, not a half."""
+    with FileLock(f"{path}.lock"):
+        if path.exists() and path.stat().st_size > 0:
+            return
+        part = path.with_name(f"{path.name}.part")
+        part.unlink(missing_ok=True)
+        try:
+            MlflowClient(f"sqlite:///{part}").search_experiments()
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
+
+
+def _check_server(uri: str) -> None:
+    try:
+        urllib.request.urlopen(f"{uri.rstrip('/')}/health", timeout=10).close()
+    except urllib.error.HTTPError:
+        pass  # it answers; a server behind a gateway may lack this page
+    except OSError as error:
+        reason: Any = getattr(error, "reason", error)
+        raise StoreError(f"{uri}: the MLflow server does not answer ({reason}); see MLFLOW_TRACKING_URI") from error
+
+
+@contextmanager
+def explained(uri: str) -> Iterator[None]:
+    """Turn what MLflow, its database or the disk raise into one line that names the store."""
+    try:
+        yield
+    except StoreError:
+        raise
+    except (MlflowException, SQLAlchemyError, sqlite3.Error, OSError) as error:
+        raise StoreError(f"{uri}: MLflow cannot go on: {one_line(error)}") from error

@@ -1,0 +1,102 @@
+"""What a study asks for, set against what is there."""
+
+import json
+import subprocess
+from collections.abc import Iterable
+from io import StringIO
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ruamel.yaml import YAML
+
+from pipelines.study import RunSpec, Study
+from pipelines.tracker import Card, Recorded, StudyCard
+
+
+class Item(NamedTuple):
+    """A planned run with what a log needs to know of it."""
+
+    card: Card
+    spec: RunSpec
+
+    @property
+    def name(self) -> str:
+        """What a person calls it."""
+        return f"{self.card.arm} s{self.card.seed}"
+
+    @property
+    def key(self) -> str:
+        """Names the training: spec id and fingerprint."""
+        return self.card.key
+
+
+def items(study: Study, fingerprint: str, commit: str) -> list[Item]:
+    """The runs of a study, in its order."""
+    runs = study.runs()
+    varying = what_varies([run.spec for run in runs])
+    planned = []
+    for run in runs:
+        spec, flat = run.spec, flatten(run.spec.model_dump(mode="json"))
+        params = {name: str(flat[name]) for name in varying if name in flat} | {"seed": str(spec.seed)}
+        algorithm, task = spec.algo.kind, spec.env.kind
+        card = Card(run.arm, spec.seed, spec.id, fingerprint, algorithm, task, commit, params)
+        planned.append(Item(card, spec))
+    return planned
+
+
+def flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested mappings as one with dotted names."""
+    flat: dict[str, Any] = {}
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            flat |= flatten(value, f"{prefix}{name}.")
+        else:
+            flat[prefix + name] = value
+    return flat
+
+
+def what_varies(specs: Iterable[RunSpec]) -> list[str]:
+    """The dotted names whose value is not the same in all specs."""
+    flats = [flatten(spec.model_dump(mode="json")) for spec in specs]
+    names = {name: None for flat in flats for name in flat}
+    return [name for name in names if len({json.dumps(flat.get(name)) for flat in flats}) > 1]
+
+
+def study_card(study: Study) -> StudyCard:
+    """The study as its experiment shows it."""
+    arms = list(dict.fromkeys(run.arm for run in study.runs()))
+    seeds = sorted({run.spec.seed for run in study.runs()})
+    steps = sorted({run.spec.trainer.steps for run in study.runs()})
+    budget = ", ".join(f"{count:,}" for count in steps)
+    note = (
+        f"**{study.question}**\n\n"
+        f"Profile `{study.profile}`: {len(arms)} arms × {len(seeds)} seeds, {budget} environment steps each.\n\n"
+        + "\n".join(f"- {arm}" for arm in arms)
+        + "\n\nGroup the runs by the tag `variant` to compare arms."
+    )
+    return StudyCard(study.name, study.profile, note)
+
+
+def finished(recorded: Iterable[Recorded]) -> set[tuple[str, str]]:
+    """(arm, key) of the runs that need nothing more."""
+    return {(run.arm, run.key) for run in recorded if run.status == "finished"}
+
+
+def resolved_yaml(item: Item, study: StudyCard) -> str:
+    """The full configuration of a run, defaults written out."""
+    head = {"study": study.study, "profile": study.profile, "arm": item.card.arm}
+    names = {"spec_id": item.card.spec_id, "fingerprint": item.card.fingerprint, "commit": item.card.commit}
+    out = StringIO()
+    YAML().dump(head | names | item.spec.model_dump(mode="json"), out)
+    return out.getvalue()
+
+
+def commit() -> str:
+    """The commit of the code, with `-dirty` where files differ from it; `unknown` outside a repository."""
+    here = Path(__file__).parent
+    try:
+        command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+        done = subprocess.run(command, cwd=here, capture_output=True, text=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+    return done.stdout.strip() or "unknown"

@@ -1,0 +1,184 @@
+"""What a person sees while a study runs: a live line per run on a terminal, plain lines elsewhere."""
+
+import time
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Protocol, Self
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
+from rich.table import Table
+
+from rhmc.types import Metrics
+
+EVERY = 10.0  # seconds between two plain lines of a run
+
+
+@dataclass
+class Line:
+    """The state of one running run."""
+
+    name: str
+    total: int  # environment steps
+    step: int = 0
+    rate: float = 0.0  # environment steps per second
+    score: float = float("nan")  # last return
+    shown: float = field(default=float("-inf"))  # when it was last printed
+
+    def take(self, point: Metrics) -> None:
+        """Read a new point."""
+        self.step = int(point["step"])
+        self.score = point.get("final/return", point.get("eval/return", self.score))
+        if self.step > 0:
+            self.rate = point.get("time/steps_per_second", self.rate)
+
+    @property
+    def left(self) -> str:
+        """Time left at the present rate."""
+        return duration((self.total - self.step) / self.rate) if self.rate > 0 else "?"
+
+    def __str__(self) -> str:
+        steps = f"{min(self.step, self.total):,} of {self.total:,} steps"
+        return f"{self.name}: {steps}, {self.rate:,.0f} steps/s, return {self.score:.2f}, {self.left} left"
+
+
+def duration(seconds: float) -> str:
+    """Seconds as 12 s, 3:05 or 1:03:05."""
+    whole = max(0, round(seconds))
+    if whole < 60:
+        return f"{whole} s"
+    minutes, rest = divmod(whole, 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
+
+
+class Board(Protocol):
+    """Where progress is shown."""
+
+    def __enter__(self) -> Self: ...
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+
+    def start(self, name: str, total: int) -> None:
+        """A run begins or continues; `total` environment steps."""
+        ...
+
+    def points(self, name: str, points: list[Metrics]) -> None:
+        """A run got further."""
+        ...
+
+    def end(self, name: str, outcome: str) -> None:
+        """A run ended."""
+        ...
+
+    def say(self, text: str) -> None:
+        """A line that stays."""
+        ...
+
+
+class PlainBoard:
+    """Lines for a log file: a run's start and end, and what it did at most every ten seconds."""
+
+    def __init__(self, console: Console) -> None:
+        self.console = console
+        self.lines: dict[str, Line] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        pass
+
+    def start(self, name: str, total: int) -> None:
+        """See `Board`."""
+        self.lines[name] = Line(name, total, shown=time.monotonic())
+        self.say(f"{name}: started")
+
+    def points(self, name: str, points: list[Metrics]) -> None:
+        """See `Board`."""
+        line = self.lines[name]
+        for point in points:
+            line.take(point)
+        if points and time.monotonic() - line.shown >= EVERY:
+            line.shown = time.monotonic()
+            self.say(str(line))
+
+    def end(self, name: str, outcome: str) -> None:
+        """See `Board`."""
+        line = self.lines.pop(name, None)
+        score = f", return {line.score:.2f}" if line and line.score == line.score else ""
+        self.say(f"{name}: {outcome}{score}")
+
+    def say(self, text: str) -> None:
+        """See `Board`."""
+        self.console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+class LiveBoard:
+    """One line per running run, redrawn in place; what ended stays above."""
+
+    def __init__(self, console: Console) -> None:
+        text = ("{task.fields[steps]}", "{task.fields[rate]}", "{task.fields[score]}", "{task.fields[left]}")
+        columns = [TextColumn("{task.description}"), BarColumn(20), *(TextColumn(t) for t in text)]
+        self.progress = Progress(*columns, console=console, transient=True)
+        self.lines: dict[str, tuple[Line, TaskID]] = {}
+
+    def __enter__(self) -> Self:
+        self.progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.progress.stop()
+
+    def start(self, name: str, total: int) -> None:
+        """See `Board`."""
+        task = self.progress.add_task(name, total=total, steps="starting", rate="", score="", left="")
+        self.lines[name] = Line(name, total), task
+
+    def points(self, name: str, points: list[Metrics]) -> None:
+        """See `Board`."""
+        line, task = self.lines[name]
+        for point in points:
+            line.take(point)
+        self.progress.update(
+            task,
+            completed=line.step,
+            steps=f"{line.step:,}/{line.total:,}",
+            rate=f"{line.rate:,.0f} steps/s",
+            score=f"return {line.score:.2f}",
+            left=f"{line.left} left",
+        )
+
+    def end(self, name: str, outcome: str) -> None:
+        """See `Board`."""
+        line, task = self.lines.pop(name, (None, None))
+        if line is None or task is None:
+            self.say(f"{name}: {outcome}")
+            return
+        self.progress.remove_task(task)
+        score = f", return {line.score:.2f}" if line.score == line.score else ""
+        self.say(f"{name}: {outcome}{score}")
+
+    def say(self, text: str) -> None:
+        """See `Board`."""
+        self.progress.console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def board(console: Console) -> Board:
+    """The board that suits where the output goes."""
+    return LiveBoard(console) if console.is_terminal else PlainBoard(console)
+
+
+def print_table(console: Console, header: list[str], rows: list[list[str]]) -> None:
+    """A small table; every column but the first is numbers."""
+    table = Table(box=None, pad_edge=False, padding=(0, 3, 0, 0))
+    for place, title in enumerate(header):
+        table.add_column(title, justify="right" if place else "left", no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    console.print(table)

@@ -1,0 +1,102 @@
+"""From results of training to the log and the board; knows neither Ray nor MLflow."""
+
+from collections import defaultdict
+from typing import Any
+
+from pipelines.plan import Item, finished, resolved_yaml
+from pipelines.progress import Board
+from pipelines.store import Checkpoints, Home
+from pipelines.tracker import RunLog, Status, StudyCard, Tracker, points_of
+
+
+class Recorder:
+    """Keeps a study's log in step with its trainings, which are named by key.
+
+    Runs of different arms with the same key are one training and one log each.
+
+    Args:
+        study: whose runs.
+        plan: all of them.
+        tracker: the log.
+        home: where checkpoints lie.
+        board: where progress is shown.
+    """
+
+    def __init__(self, study: StudyCard, plan: list[Item], tracker: Tracker, home: Home, board: Board) -> None:
+        self.study, self.plan, self.tracker, self.home, self.board = study, plan, tracker, home, board
+        self.logs: dict[str, RunLog] = {}
+        self.failures: dict[str, str] = {}  # name of the run -> one line
+        self.waiting: dict[str, list[Item]] = defaultdict(list)
+        done = finished(tracker.recorded())
+        for item in plan:
+            if (item.card.arm, item.key) not in done:
+                self.waiting[item.key].append(item)
+        self.skipped = len(plan) - self.left
+
+    @property
+    def left(self) -> int:
+        """Planned runs that are not finished."""
+        return sum(len(items) for items in self.waiting.values())
+
+    def reuse(self) -> None:
+        """Copy what was finished already, for another arm or in another study, instead of training it again."""
+        if not self.waiting:
+            return
+        there = self.tracker.finished_anywhere(self.plan[0].card.fingerprint)
+        for key in [key for key in self.waiting if key in there]:
+            self._copy(there[key], self.waiting.pop(key))
+
+    def _copy(self, source: str, items: list[Item]) -> None:
+        points = points_of(self.tracker.rows([source])) if items else []
+        for item in items:
+            log = self.tracker.start(item.card)
+            log.log(points)
+            log.text("config.yaml", resolved_yaml(item, self.study))
+            log.tag("reused_from", source)
+            log.finish("finished")
+            self.board.say(f"{item.name}: the same training was finished before; copied")
+
+    def todo(self) -> list[Item]:
+        """One run for each training that is needed, in the order of the plan."""
+        return [items[0] for items in self.waiting.values()]
+
+    def start(self, key: str) -> None:
+        """A training begins or continues."""
+        item = self.waiting[key][0]
+        self.logs[key] = self.tracker.start(item.card)
+        self.board.start(item.name, item.spec.trainer.steps)
+
+    def result(self, key: str, result: dict[str, Any]) -> None:
+        """New points of a training; the last ones finish its run."""
+        item, points = self.waiting[key][0], result["points"]
+        self.logs[key].log(points)
+        self.board.points(item.name, points)
+        if result["stopped"]:
+            self._end(key, "interrupted")
+            self.board.end(item.name, "stopped; the next launch continues it")
+        elif result["done"]:
+            self._finish(key)
+
+    def _finish(self, key: str) -> None:
+        log, items, folder = self.logs[key], self.waiting.pop(key), self.home.checkpoints(key)
+        log.text("config.yaml", resolved_yaml(items[0], self.study))
+        log.artifact(folder / "policy.pt")
+        self._end(key, "finished")
+        self.board.end(items[0].name, "finished")
+        self._copy(log.ref, items[1:])
+        Checkpoints(folder).clear()
+
+    def failed(self, key: str, error: str, trace: str) -> None:
+        """A training failed: keep why, go on with the others."""
+        item = self.waiting[key][0]
+        if key not in self.logs:
+            self.start(key)
+        self.failures[item.name] = error
+        log = self.logs[key]
+        log.tag("error", error)
+        log.text("error.txt", trace)
+        self._end(key, "failed")
+        self.board.end(item.name, f"failed: {error}")
+
+    def _end(self, key: str, status: Status) -> None:
+        self.logs.pop(key).finish(status)

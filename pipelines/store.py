@@ -1,0 +1,178 @@
+"""The work folder: where it is, who may write to a study, and checkpoints that survive a killed process."""
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import torch
+from filelock import FileLock, Timeout
+
+from pipelines.errors import InputError
+from rhmc.types import State
+
+KEEP = 2  # checkpoints kept: should the newest be cut short, the one before is used
+
+
+class StoreError(InputError):
+    """Something outside the program is in the way; str() is the whole message, one line."""
+
+
+def work_folder() -> Path:
+    """`$RHMC_HOME`, or `work` in the current folder."""
+    return Path(os.environ.get("RHMC_HOME") or "work").resolve()
+
+
+class Home:
+    """The paths inside a work folder.
+
+    Args:
+        root: the folder; made when the first file is written.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root.resolve()
+        self.database = self.root / "mlflow.db"
+        self.artifacts = self.root / "artifacts"
+
+    def checkpoints(self, key: str) -> Path:
+        """Where the checkpoints of a run (spec id and fingerprint) lie."""
+        return self.root / "checkpoints" / key
+
+    def scratch(self, study: str, profile: str) -> Path:
+        """What Ray writes while a study runs; worth nothing afterwards."""
+        return self.root / "ray" / f"{study}-{profile}"
+
+    def prepare(self) -> None:
+        """Make the folder and see that it can be written to.
+
+        Raises:
+            StoreError: it cannot.
+        """
+        probe = self.root / f".probe-{os.getpid()}"
+        try:
+            self.root.mkdir(parents=True, exist_ok=True)
+            probe.write_bytes(b"x" * 4096)
+            probe.unlink()
+        except OSError as error:
+            with suppress(OSError):
+                probe.unlink(missing_ok=True)
+            raise StoreError(f"{self.root}: cannot be written to: {error.strerror or error}") from error
+
+    @contextmanager
+    def lock(self, study: str, profile: str) -> Iterator[None]:
+        """Hold a study and profile while driving it; the system lets go when the process dies, however it dies.
+
+        Raises:
+            StoreError: another process drives it.
+        """
+        path = self.root / "locks" / f"{study}-{profile}.lock"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        owner = path.with_suffix(".pid")
+        lock = FileLock(path)
+        try:
+            lock.acquire(timeout=0)
+        except Timeout as error:
+            pid = owner.read_text().strip() if owner.exists() else "unknown"
+            message = f"{study} ({profile}) is already being run by process {pid} ({path}); wait for it or stop it"
+            raise StoreError(message) from error
+        try:
+            owner.write_text(f"{os.getpid()}\n")
+            yield
+        finally:
+            lock.release()
+
+
+class Checkpoints:
+    """The newest checkpoints of one run, as files `<point>.pt`.
+
+    Args:
+        folder: theirs alone.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def save(self, point: int, state: State) -> None:
+        """Write a checkpoint whole or not at all, and drop those older than the last two."""
+        save_atomically(self.folder / f"{point:08d}.pt", state)
+        for old in self._files()[KEEP:]:
+            old.unlink(missing_ok=True)
+
+    def newest(self) -> State | None:
+        """The newest checkpoint that can be read, or None. Unreadable ones are removed."""
+        for file in self._files():
+            try:
+                return torch.load(file, weights_only=True, map_location="cpu")
+            except Exception:  # cut short, or not a checkpoint: torch raises several kinds
+                file.unlink(missing_ok=True)
+        return None
+
+    def _files(self) -> list[Path]:
+        return sorted(self.folder.glob("[0-9]*.pt"), reverse=True)
+
+    def clear(self) -> None:
+        """Remove the folder."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def save_atomically(path: Path, state: Any) -> None:
+    """`torch.save` so that a reader meets the old file or the new one, also after a power cut.
+
+    Raises:
+        StoreError: the disk is full or the folder closed; nothing half-written is left.
+    """
+    part = path.with_suffix(f".{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with part.open("wb") as file:
+            torch.save(state, file)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except (OSError, RuntimeError) as error:  # torch reports a failed write as RuntimeError
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+        raise StoreError(f"{path}: cannot be written: {reason(error)}") from error
+    sync_folder(path.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Make a rename in the folder durable."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def without_replay(state: Any) -> Any:
+    """A copy of a state in which every replay is empty: enough to act with, small enough to keep for good.
+
+    A replay is recognised by its keys (`rows`, `next`, `size`).
+    """
+    if isinstance(state, dict):
+        if state.keys() == {"rows", "next", "size"}:
+            return {"rows": {}, "next": 0, "size": 0}
+        return {key: without_replay(value) for key, value in state.items()}
+    if isinstance(state, list | tuple):
+        return type(state)(without_replay(value) for value in state)
+    return state
+
+
+def one_line(error: BaseException) -> str:
+    """The first telling line of an error."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[0] if lines else type(error).__name__
+
+
+def reason(error: BaseException) -> str:
+    """What the system said, where a library wrapped it in words of its own."""
+    inner: BaseException | None = error
+    while inner is not None:
+        if isinstance(inner, OSError) and inner.strerror:
+            return inner.strerror
+        inner = inner.__cause__ or inner.__context__
+    return one_line(error)

@@ -1,0 +1,209 @@
+"""Where runs are logged: the protocol, and a twin in memory that obeys it.
+
+A run in a log is named by study, profile, arm and key (spec id and code fingerprint). Starting one that is there
+already continues it. A point that is logged already is not logged again.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from itertools import count
+from pathlib import Path
+from typing import Literal, NamedTuple, Protocol
+
+from rhmc.types import Metrics
+
+Status = Literal["running", "finished", "failed", "interrupted"]
+
+
+class StudyCard(NamedTuple):
+    """A study as its log shows it."""
+
+    study: str
+    profile: str
+    note: str  # Markdown: question, arms, seeds, budget
+
+
+class Card(NamedTuple):
+    """A run as its log shows it."""
+
+    arm: str
+    seed: int
+    spec_id: str
+    fingerprint: str
+    algorithm: str
+    task: str
+    commit: str
+    params: dict[str, str]  # what varies between the runs of the study, and the seed
+
+    @property
+    def key(self) -> str:
+        """What was trained: spec id and fingerprint."""
+        return f"{self.spec_id}-{self.fingerprint}"
+
+
+class Recorded(NamedTuple):
+    """A run found in a log."""
+
+    ref: str  # the log's own name of it
+    arm: str
+    key: str
+    status: Status
+    commit: str
+
+
+class Row(NamedTuple):
+    """One value of one metric."""
+
+    ref: str
+    step: int
+    metric: str
+    value: float
+
+
+class RunLog(Protocol):
+    """One run that is being logged."""
+
+    @property
+    def ref(self) -> str: ...
+
+    def log(self, points: Sequence[Metrics]) -> None:
+        """Add points (each with a key `step`); values of a metric and step that are there already are left alone."""
+        ...
+
+    def artifact(self, path: Path) -> None:
+        """Keep a copy of a file under its name."""
+        ...
+
+    def text(self, name: str, content: str) -> None:
+        """Keep a text under a file name."""
+        ...
+
+    def tag(self, name: str, value: str) -> None:
+        """Set or replace a tag."""
+        ...
+
+    def finish(self, status: Status) -> None:
+        """Close the run. It can be started again."""
+        ...
+
+
+class Tracker(Protocol):
+    """The log of one study and profile."""
+
+    def recorded(self) -> list[Recorded]:
+        """The runs logged so far, oldest first."""
+        ...
+
+    def finished_anywhere(self, fingerprint: str) -> dict[str, str]:
+        """Key -> ref of a finished run, of whatever study shares the log."""
+        ...
+
+    def start(self, card: Card) -> RunLog:
+        """Begin a run, or continue it."""
+        ...
+
+    def rows(self, refs: Sequence[str]) -> list[Row]:
+        """All values of the runs, each metric and step once, sorted."""
+        ...
+
+    def close(self, status: Status) -> None:
+        """End the present launch. Runs left running become `interrupted`."""
+        ...
+
+
+def unseen(points: Iterable[Metrics], seen: set[tuple[str, int]]) -> list[tuple[str, int, float]]:
+    """(metric, step, value) of each value that is not in `seen`, which is brought up to date."""
+    new = []
+    for point in points:
+        step = int(point["step"])
+        for metric, value in point.items():
+            if metric != "step" and (metric, step) not in seen:
+                seen.add((metric, step))
+                new.append((metric, step, value))
+    return new
+
+
+def points_of(rows: Iterable[Row]) -> list[Metrics]:
+    """The rows of one run as the points they came from."""
+    points: dict[int, Metrics] = {}
+    for row in rows:
+        points.setdefault(row.step, {"step": float(row.step)})[row.metric] = row.value
+    return [points[step] for step in sorted(points)]
+
+
+@dataclass
+class MemoryRun:
+    """A run of the twin."""
+
+    ref: str
+    study: StudyCard
+    card: Card
+    status: Status = "running"
+    values: list[Row] = field(default_factory=list)
+    seen: set[tuple[str, int]] = field(default_factory=set)
+    tags: dict[str, str] = field(default_factory=dict)
+    files: dict[str, bytes] = field(default_factory=dict)
+
+    def log(self, points: Sequence[Metrics]) -> None:
+        """See `RunLog`."""
+        self.values += [Row(self.ref, step, metric, value) for metric, step, value in unseen(points, self.seen)]
+
+    def artifact(self, path: Path) -> None:
+        """See `RunLog`."""
+        self.files[path.name] = path.read_bytes()
+
+    def text(self, name: str, content: str) -> None:
+        """See `RunLog`."""
+        self.files[name] = content.encode()
+
+    def tag(self, name: str, value: str) -> None:
+        """See `RunLog`."""
+        self.tags[name] = value
+
+    def finish(self, status: Status) -> None:
+        """See `RunLog`."""
+        self.status = status
+
+
+class MemoryTracker:
+    """The twin: what several of them share is `shelf`, as trackers of MLflow share a database."""
+
+    def __init__(self, study: StudyCard, shelf: list[MemoryRun]) -> None:
+        self.study, self.shelf = study, shelf
+        self.names = count(len(shelf))
+        self._interrupt_running()
+
+    def _mine(self) -> list[MemoryRun]:
+        return [run for run in self.shelf if run.study[:2] == self.study[:2]]
+
+    def _interrupt_running(self) -> None:
+        for run in self._mine():
+            if run.status == "running":
+                run.finish("interrupted")
+
+    def recorded(self) -> list[Recorded]:
+        """See `Tracker`."""
+        return [Recorded(r.ref, r.card.arm, r.card.key, r.status, r.card.commit) for r in self._mine()]
+
+    def finished_anywhere(self, fingerprint: str) -> dict[str, str]:
+        """See `Tracker`."""
+        done = [r for r in self.shelf if r.status == "finished" and r.card.fingerprint == fingerprint]
+        return {r.card.key: r.ref for r in reversed(done)}
+
+    def start(self, card: Card) -> MemoryRun:
+        """See `Tracker`."""
+        for run in self._mine():
+            if (run.card.arm, run.card.key) == (card.arm, card.key):
+                run.status = "running"
+                return run
+        run = MemoryRun(f"run-{next(self.names)}", self.study, card)
+        self.shelf.append(run)
+        return run
+
+    def rows(self, refs: Sequence[str]) -> list[Row]:
+        """See `Tracker`."""
+        return sorted(row for run in self.shelf if run.ref in refs for row in run.values)
+
+    def close(self, status: Status) -> None:
+        """See `Tracker`."""
+        self._interrupt_running()

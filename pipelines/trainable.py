@@ -1,0 +1,126 @@
+"""One run of a study as a Ray trial: a step trains to the next point of the grid.
+
+The trial is idempotent: whoever starts a run again, in whatever process, continues from its newest checkpoint. Ray's
+own checkpoints are therefore not used.
+"""
+
+import time
+from pathlib import Path
+from typing import Any, TypedDict
+
+from filelock import FileLock, Timeout
+from ray.tune import Trainable
+
+from pipelines.store import Checkpoints, StoreError, save_atomically, without_replay
+from pipelines.study import RunSpec
+from rhmc.trainer import Trainer
+from rhmc.types import Metrics, State
+
+PATIENCE = 60.0  # seconds to wait for the worker of a killed driver to let go of a run
+
+
+class Job(TypedDict):
+    """What a worker gets: plain values."""
+
+    key: str  # spec id and fingerprint
+    spec: str  # JSON
+    folder: str  # of the run's checkpoints
+    checkpoint_every: int  # points of the grid
+    stop: str  # a file: once it exists, the run saves itself at the next point and ends
+
+
+class RunTrainable(Trainable):
+    """See the module. Configuration: `{"job": Job}`.
+
+    A result has `done`, `stopped`, `seconds` and `points`: the new point of the grid, and at the first step of a
+    continued run every point before it as well, so that a log can be made whole.
+    """
+
+    def setup(self, config: dict[str, Any]) -> None:
+        """Take the run and load its newest checkpoint."""
+        job: Job = config["job"]
+        self.job = job
+        self.stop_file = Path(job["stop"])
+        self.checkpoints = Checkpoints(Path(job["folder"]))
+        self.lock = FileLock(f"{job['folder']}.lock")
+        self.trainer: Trainer | None = None
+        self.history: list[Metrics] = []
+        self.seconds = 0.0
+        self.reported = self.saved = 0  # points told to the driver; points in the newest checkpoint
+        if not self.stop_file.exists():
+            self._begin()
+
+    def _begin(self) -> None:
+        Path(self.job["folder"]).parent.mkdir(parents=True, exist_ok=True)
+        try:
+            self.lock.acquire(timeout=PATIENCE)
+        except Timeout as error:
+            raise StoreError(f"{self.job['folder']}: another process is training this run") from error
+        spec = RunSpec.model_validate_json(self.job["spec"])
+        self.trainer = Trainer(spec.env, spec.algo, spec.trainer, spec.seed)
+        if state := self.checkpoints.newest():
+            self.load_state(state)
+
+    def step(self) -> dict[str, Any]:
+        """Train to the next point."""
+        if self.trainer is None:
+            return {"done": True, "stopped": True, "points": [], "seconds": self.seconds}
+        if not self.trainer.done:
+            self._advance(self.trainer)
+        done, stopped = self.trainer.done, self.stop_file.exists()
+        if done or stopped or len(self.history) - self.saved >= self.job["checkpoint_every"]:
+            self._save()
+        points, self.reported = self.history[self.reported :], len(self.history)
+        return {"done": done or stopped, "stopped": stopped and not done, "points": points, "seconds": self.seconds}
+
+    def _advance(self, trainer: Trainer) -> None:
+        start, before = time.perf_counter(), trainer.step
+        metrics = next(trainer)
+        spent = time.perf_counter() - start
+        self.seconds += spent
+        timing = {"time/seconds": self.seconds, "time/steps_per_second": (trainer.step - before) / spent}
+        self.history.append(metrics | timing)
+
+    def _save(self) -> None:
+        if len(self.history) == self.saved:
+            return
+        assert self.trainer is not None
+        state = self.state()
+        if self.trainer.done:
+            save_atomically(self.checkpoints.folder / "policy.pt", without_replay(state["trainer"]))
+        self.checkpoints.save(len(self.history), state)
+        self.saved = len(self.history)
+
+    def state(self) -> State:
+        """All of the run between two points: the trainer, and the metrics so far for a log that missed some."""
+        assert self.trainer is not None
+        return {"trainer": self.trainer.state_dict(), "history": self.history, "seconds": self.seconds}
+
+    def load_state(self, state: State) -> None:
+        """Continue from `state`."""
+        assert self.trainer is not None
+        self.trainer.load_state_dict(state["trainer"])
+        self.history, self.seconds = list(state["history"]), state["seconds"]
+        self.saved = len(self.history)
+
+    def save_checkpoint(self, checkpoint_dir: str) -> None:
+        """Ray's own way to save; the studies do not use it."""
+        Checkpoints(Path(checkpoint_dir)).save(len(self.history), self.state())
+
+    def load_checkpoint(self, checkpoint: Any) -> None:
+        """Ray's own way to load."""
+        state = Checkpoints(Path(checkpoint)).newest()
+        if state is None:
+            raise StoreError(f"{checkpoint}: no readable checkpoint")
+        self.load_state(state)
+
+    def reset_config(self, new_config: dict[str, Any]) -> bool:
+        """Let the next run use this process."""
+        self.cleanup()
+        self.setup(new_config)
+        return True
+
+    def cleanup(self) -> None:
+        """Let go of the run."""
+        self.trainer = None
+        self.lock.release()

@@ -1,0 +1,319 @@
+"""The exported tables, read and checked: everything a report shows comes from here.
+
+A folder holds, per study, `<study>.parquet` (one row per run, step and metric) and `<study>.runs.parquet` (one row per
+planned run). What is wrong in them is an error of one line per fault; what is not there yet is listed as missing.
+"""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+POINTS = ("study", "arm", "seed", "run", "step", "metric", "value")
+RUNS = (
+    "study",
+    "arm",
+    "seed",
+    "run",
+    "status",
+    "algorithm",
+    "task",
+    "profile",
+    "config",
+    "fingerprint",
+    "commit",
+    "question",
+    "seconds",
+)
+STATUSES = ("finished", "partial", "missing")
+YARDSTICKS, THEOREM = "yardsticks", "theorem"  # tables that are no studies
+FINAL, CURVE = "final/return", "eval/return"
+ERRORS = ("final/return_sem", "final/coverage_sem")  # of a scripted policy; one of both is there
+CHECKED = ("final/", "eval/", "theorem/")  # metrics that are shown: they must be finite
+SHOWN = 5  # faults of one kind that are spelled out
+
+# The order of arms everywhere; others follow by name.
+ORDER = (
+    "full",
+    "no regulation",
+    "no filter",
+    "RHMC",
+    "HiT-MAC",
+    "QMIX",
+    "VDN",
+    "IQL",
+    "COMA",
+    "MAPPO",
+    "IPPO",
+    "MADDPG",
+)
+
+
+class TableError(ValueError):
+    """The tables cannot be reported on; the message holds one line per fault."""
+
+
+@dataclass(frozen=True)
+class Results:
+    """Checked tables of one profile.
+
+    Attributes:
+        points: columns `POINTS`.
+        runs: columns `RUNS`; one row per planned run.
+        profile: the profile that made them.
+    """
+
+    points: pd.DataFrame
+    runs: pd.DataFrame
+    profile: str
+
+    @property
+    def studies(self) -> list[str]:
+        """Names of the studies, yardsticks and theorem left out."""
+        return sorted(set(self.runs["study"]) - {YARDSTICKS, THEOREM})
+
+    def arms(self, study: str) -> list[str]:
+        """Planned arms of a study in the order of `ORDER`; none if the study is not there."""
+        found = set(self.runs.loc[self.runs["study"] == study, "arm"])
+        return sorted(found, key=lambda arm: (ORDER.index(arm) if arm in ORDER else len(ORDER), arm))
+
+    def plan(self, study: str, arm: str | None = None) -> pd.DataFrame:
+        """Planned runs of a study or of one of its arms, by arm and seed."""
+        rows = self.runs[(self.runs["study"] == study) & (True if arm is None else self.runs["arm"] == arm)]
+        return rows.sort_values(["arm", "seed"], kind="stable")
+
+    def finished(self, study: str, arm: str) -> pd.DataFrame:
+        """Planned runs of an arm that are finished."""
+        rows = self.plan(study, arm)
+        return rows[rows["status"] == "finished"]
+
+    def finals(self, study: str, arm: str, metric: str = FINAL) -> NDArray[np.float64]:
+        """Final values of an arm's finished runs, by seed: (n,), empty if there are none."""
+        rows = self._select(study, metric)
+        keep = (rows["arm"] == arm) & rows["seed"].isin(self.finished(study, arm)["seed"])
+        return rows[keep].sort_values("seed")["value"].to_numpy(np.float64)
+
+    def curve(self, study: str, arm: str, metric: str = CURVE) -> pd.DataFrame:
+        """Points of an arm's runs, unfinished ones included: columns seed, step, value."""
+        rows = self._select(study, metric)
+        rows = rows[rows["arm"] == arm].sort_values(["seed", "step"])
+        return rows[["seed", "step", "value"]].reset_index(drop=True)
+
+    def budget(self, study: str) -> int | None:
+        """Environment steps per run as configured, the largest where arms differ; None without runs."""
+        return self._trainer(study, "steps")
+
+    def final_episodes(self, study: str) -> int | None:
+        """Episodes behind a run's final return; None if not written in its configuration."""
+        return self._trainer(study, "final_episodes")
+
+    def env(self, study: str) -> dict[str, Any]:
+        """Task configuration of a study's first run; empty if the study is not there."""
+        texts = self.plan(study)["config"]
+        return dict(_config(texts.iloc[0]).get("env", {})) if len(texts) else {}
+
+    def by_agents(self, study: str) -> dict[int, dict[str, str]]:
+        """Arms of a study by number of agents, then by kind of algorithm, as their configurations say."""
+        out: dict[int, dict[str, str]] = {}
+        for row in self.plan(study).itertuples():
+            agents = _config(str(row.config)).get("env", {}).get("agents")
+            if agents is not None:
+                out.setdefault(int(agents), {})[str(row.algorithm)] = str(row.arm)
+        return dict(sorted(out.items()))
+
+    @cached_property
+    def yardsticks(self) -> list[tuple[dict[str, Any], pd.DataFrame]]:
+        """Per task: its configuration, and one row per scripted policy (index) with a column per metric."""
+        found: dict[str, set[str]] = {}
+        for row in self.runs[self.runs["study"] == YARDSTICKS].itertuples():
+            key = json.dumps(_config(str(row.config)).get("env", {}), sort_keys=True)
+            found.setdefault(key, set()).add(str(row.run))
+        points = self.points[self.points["study"] == YARDSTICKS]
+        out = []
+        for key in sorted(found):
+            table = points[points["run"].isin(found[key])].pivot_table(index="arm", columns="metric", values="value")
+            out.append((json.loads(key), table.sort_values(FINAL) if FINAL in table else table))
+        return out
+
+    def yardsticks_of(self, study: str) -> pd.DataFrame:
+        """Scripted policies on a study's task, however agents observe it; empty if none were run."""
+        env = self.env(study)
+        for task, table in self.yardsticks:
+            if env and same_task(env, task):
+                return table
+        return pd.DataFrame()
+
+    def gaps(self, expected: Mapping[str, Sequence[str]]) -> list[str]:
+        """What is not there, in sentences.
+
+        Args:
+            expected: arms that the paper has, per study.
+        """
+        return [line for study in sorted({*expected, *self.studies}) for line in self._gaps(study, expected)]
+
+    def _gaps(self, study: str, expected: Mapping[str, Sequence[str]]) -> Iterator[str]:
+        arms = self.arms(study)
+        if not arms:
+            yield f"Study `{study}`: no results."
+            return
+        for arm in arms:
+            rows = self.plan(study, arm)
+            for status, words in (("missing", "not run"), ("partial", "unfinished")):
+                seeds = rows.loc[rows["status"] == status, "seed"]
+                if len(seeds):
+                    listed = ", ".join(map(str, seeds))
+                    yield f"Study `{study}`, arm {arm}: {len(seeds)} of {len(rows)} seeds {words} (seed {listed})."
+        absent = [arm for arm in expected.get(study, ()) if arm not in arms]
+        if absent:
+            yield f"Study `{study}`: no such arm yet: {', '.join(absent)}."
+        if self.yardsticks_of(study).empty:
+            yield f"Study `{study}`: no scripted policies were run on this task."
+
+    def _trainer(self, study: str, name: str) -> int | None:
+        found = [_config(text).get("trainer", {}).get(name) for text in self.plan(study)["config"]]
+        return max((int(x) for x in found if x is not None), default=None)
+
+    def _select(self, study: str, metric: str) -> pd.DataFrame:
+        return self._metrics.get((study, metric), self.points.iloc[:0])
+
+    @cached_property
+    def _metrics(self) -> dict[tuple[str, str], pd.DataFrame]:
+        return {(str(key[0]), str(key[1])): rows for key, rows in self.points.groupby(["study", "metric"])}
+
+
+def load(folder: Path, profile: str) -> Results:
+    """Read and check every table of a folder.
+
+    Raises:
+        TableError: the folder holds no tables, or they are faulty.
+    """
+    files = sorted(folder.glob("*.parquet"))
+    if not files:
+        raise TableError(f"{folder}: no tables here; `rhmc export` writes them")
+    faults: list[str] = []
+    points: list[pd.DataFrame] = []
+    runs: list[pd.DataFrame] = []
+    for path in files:
+        plan = path.name.endswith(".runs.parquet")
+        table = _read(path, RUNS if plan else POINTS, faults)
+        (runs if plan else points).append(table)
+    names = {path.name.removesuffix(".parquet") for path in files}
+    for name in sorted(names):
+        if not name.endswith(".runs") and f"{name}.runs" not in names and name != THEOREM:
+            faults.append(f"{name}.parquet: {name}.runs.parquet (the planned runs) is not beside it")
+        if name.endswith(".runs") and name.removesuffix(".runs") not in names:
+            faults.append(f"{name}.parquet: {name.removesuffix('.runs')}.parquet (the points) is not beside it")
+    if not faults:
+        results = Results(_join(points, POINTS), _join(runs, RUNS), profile)
+        faults = [*_plan_faults(results), *_point_faults(results)]
+        if not faults:
+            return results
+    raise TableError("\n".join(faults))
+
+
+def same_task(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
+    """Whether two configurations are one task: how it is observed does not count, nor what only one writes out."""
+    shared = (a.keys() & b.keys()) - {"observation"}
+    return "kind" in shared and all(a[key] == b[key] for key in shared)
+
+
+def _read(path: Path, columns: Sequence[str], faults: list[str]) -> pd.DataFrame:
+    try:
+        table = pd.read_parquet(path)
+    except (OSError, ValueError):  # pyarrow's errors are among them
+        faults.append(f"{path.name}: not a readable Parquet table ({path.stat().st_size} bytes)")
+        return pd.DataFrame(columns=list(columns))
+    absent = [column for column in columns if column not in table]
+    if absent:
+        faults.append(f"{path.name}: no column {', '.join(map(repr, absent))}; there are {', '.join(table.columns)}")
+    for column in ("seed", "step", "value", "seconds"):
+        if column in table and column in columns and len(table) and not pd.api.types.is_numeric_dtype(table[column]):
+            faults.append(f"{path.name}: column {column!r} holds {table[column].dtype}, not numbers")
+    return table.reindex(columns=list(columns))
+
+
+def _join(tables: list[pd.DataFrame], columns: Sequence[str]) -> pd.DataFrame:
+    kept = [table for table in tables if len(table)]
+    return pd.concat(kept, ignore_index=True) if kept else pd.DataFrame(columns=list(columns))
+
+
+def _plan_faults(results: Results) -> Iterator[str]:
+    runs = results.runs
+    for row in runs[~runs["status"].isin(STATUSES)].itertuples():
+        yield f"{_name(row)}: status {row.status!r} is none of {', '.join(STATUSES)}"
+    for row in runs[runs["profile"] != results.profile].itertuples():
+        yield f"{_name(row)}: made with profile {row.profile!r}, and this report is of {results.profile!r}"
+    for row in runs.itertuples():
+        if not _config(str(row.config)):
+            yield f"{_name(row)}: column 'config' is no JSON object"
+    studies = runs[runs["study"] != YARDSTICKS]
+    for row in studies[studies.duplicated(["study", "arm", "seed"])].itertuples():
+        yield f"{_name(row)}: planned twice"
+    for row in studies[studies.duplicated(["study", "arm", "run"]) & (studies["status"] != "missing")].itertuples():
+        yield f"{_name(row)}: run {row.run} already stands for another seed of this arm"
+    for study, rows in studies.groupby("study"):
+        seeds = sorted(set(rows["seed"]))
+        for arm, group in rows.groupby("arm"):
+            for seed in sorted(set(seeds) - set(group["seed"])):
+                yield f"{study}, arm {arm!r}, seed {seed}: planned for other arms, and not for this one"
+
+
+def _point_faults(results: Results) -> Iterator[str]:
+    points, runs = results.points, results.runs
+    keys = ["study", "arm", "seed", "run"]
+    shown = points[points["metric"].astype(str).str.startswith(CHECKED)]
+    yield from _first(
+        f"{_name(row)}, run {row.run}, step {row.step}: {row.metric} is {row.value}"
+        for row in shown[~np.isfinite(shown["value"].astype(float))].itertuples()
+    )
+    yield from _first(
+        f"{_name(row)}, run {row.run}: {row.metric} at step {row.step} stands there twice"
+        for row in points[points.duplicated([*keys, "step", "metric"])].itertuples()
+    )
+    studied = points[points["study"] != THEOREM]
+    planned = pd.MultiIndex.from_frame(runs[keys].astype({"seed": int}))
+    found = studied.drop_duplicates(keys)
+    for row in found.itertuples():
+        if (row.study, row.arm, int(str(row.seed)), row.run) not in planned:
+            arms = ", ".join(results.arms(str(row.study))) or "none"
+            yield f"{_name(row)}, run {row.run}: has points, and is not in the plan (planned arms: {arms})"
+    counts = points.dropna(subset=["value"]).groupby(["run", "step", "metric"])["value"].nunique().reset_index()
+    differing = counts[counts["value"] > 1].drop_duplicates("run")
+    yield from _first(
+        f"run {row.run}: two values of {row.metric} at step {row.step}, so two runs share one id"
+        for row in differing.itertuples()
+    )
+    with_points = set(zip(points["study"], points["run"], strict=True))
+    finals = points[points["metric"] == FINAL]
+    with_final = set(zip(finals["study"], finals["run"], strict=True))
+    for row in runs.itertuples():
+        if row.status == "finished" and row.study != THEOREM and (row.study, row.run) not in with_final:
+            yield f"{_name(row)}, run {row.run}: marked finished, and {FINAL} is not there"
+        if row.status == "missing" and (row.study, row.run) in with_points:
+            yield f"{_name(row)}, run {row.run}: marked missing, and has points"
+
+
+def _first(lines: Iterator[str]) -> Iterator[str]:
+    """The first faults of a kind, and how many more."""
+    found = list(lines)
+    yield from found[:SHOWN]
+    if len(found) > SHOWN:
+        yield f"... and {len(found) - SHOWN} more of this kind"
+
+
+def _name(row: Any) -> str:
+    return f"{row.study}, arm {row.arm!r}, seed {row.seed}"
+
+
+def _config(text: str) -> dict[str, Any]:
+    try:
+        found = json.loads(text)
+    except json.JSONDecodeError:
+        return {}
+    return found if isinstance(found, dict) else {}

@@ -1,0 +1,211 @@
+"""Tables: plain numbers for the CSV, and the same as text for Markdown and LaTeX."""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from reports.frame import FINAL, Results
+from reports.paper import Paper
+from reports.stats import LEVEL, Interval, change, improvement, interval, iqm
+
+NONE = "–"  # where there is nothing to show
+
+
+class Table(NamedTuple):
+    """A table twice: `numbers` with full digits, one quantity a column; `shown` as text, for people."""
+
+    title: str
+    numbers: pd.DataFrame
+    shown: pd.DataFrame
+
+    def markdown(self) -> str:
+        """As a Markdown table."""
+        rows = [self.shown.columns, ["---"] * self.shown.shape[1], *self.shown.to_numpy(str)]
+        return "\n".join(f"| {' | '.join(str(cell).replace('|', '/') for cell in row)} |" for row in rows)
+
+    def latex(self) -> str:
+        """As a LaTeX table (packages: booktabs)."""
+        plain = self.shown.map(lambda text: str(text).replace(NONE, "--"))
+        body = plain.rename(columns=_escape).map(_escape)
+        return body.to_latex(index=False, column_format="l" + "r" * (body.shape[1] - 1), caption=_escape(self.title))
+
+
+def table_2(results: Results, paper: Paper) -> Table:
+    """The ablation: the paper's rows in its order, then the study's further arms."""
+    study, rows = "ablation", paper.table_2.rows
+    reference = results.finals(study, rows[0].arm)
+    named = {row.arm: row for row in rows}
+    numbers, shown = [], []
+    for arm in [*named, *(arm for arm in results.arms(study) if arm not in named)]:
+        values, row = results.finals(study, arm), named.get(arm)
+        theirs = row.final if row else np.nan
+        is_reference = arm == rows[0].arm
+        recomputed = np.nan if is_reference else 100 * (theirs / rows[0].final - 1)
+        stated = -row.stated if row and row.stated is not None else np.nan
+        ours = _estimates(values)
+        against = None if is_reference or not len(values) or not len(reference) else reference
+        lost = change(values, against) if against is not None else None
+        worse = improvement(against, values) if against is not None else None
+        numbers.append(
+            {"arm": arm, "paper_final": theirs, "paper_change_stated": stated, "paper_change_recomputed": recomputed}
+            | ours
+            | _columns("change", lost)
+            | _columns("probability_full_better", worse)
+        )
+        shown.append(
+            {
+                "Method": row.method if row else arm,
+                "Paper: final": number(theirs),
+                "Paper: change, stated": percent(stated),
+                "recomputed": percent(recomputed),
+                "Ours: final [95 %]": estimate(interval(values) if len(values) else None),
+                "IQM": number(ours["iqm"]),
+                "Seeds": seeds(results, study, arm),
+                "Change [95 %]": estimate(lost, percent),
+                "P(full better)": estimate(worse, lambda x: f"{x:.2f}"),
+            }
+        )
+    return Table("Table 2: ablation, final return", pd.DataFrame(numbers), pd.DataFrame(shown))
+
+
+def finals(results: Results, study: str) -> Table:
+    """Final values of every arm of a study, best mean first; arms without results last."""
+    order = sorted(results.arms(study), key=lambda arm: -_mean(results.finals(study, arm)))
+    order = [arm for arm in order if len(results.finals(study, arm))] + [
+        arm for arm in order if not len(results.finals(study, arm))
+    ]
+    numbers, shown = [], []
+    for arm in order:
+        values = results.finals(study, arm)
+        ours = _estimates(values)
+        low, high = (values.min(), values.max()) if len(values) else (np.nan, np.nan)
+        numbers.append({"study": study, "arm": arm} | ours | {"worst_seed": low, "best_seed": high})
+        shown.append(
+            {
+                "Arm": arm,
+                "Final return [95 %]": estimate(interval(values) if len(values) else None),
+                "IQM [95 %]": estimate(interval(values, iqm) if len(values) else None),
+                "Worst and best seed": f"{number(low)}, {number(high)}" if len(values) else NONE,
+                "Seeds": seeds(results, study, arm),
+            }
+        )
+    return Table(f"Final results of study {study}", pd.DataFrame(numbers), pd.DataFrame(shown))
+
+
+def yardsticks(results: Results) -> Table:
+    """Scripted policies and bounds of every task: mean, standard error in brackets."""
+    numbers, shown = [], []
+    for task, table in results.yardsticks:
+        names = [name for name in table.columns if not name.endswith("_sem")]
+        for row in table.reset_index().to_dict("records"):
+            numbers.append({"task": describe_task(task), "policy": row["arm"]} | {k: row[k] for k in table.columns})
+            cells = {_title(name): _with_error(row[name], row.get(f"{name}_sem", np.nan)) for name in names}
+            shown.append({"Task": describe_task(task), "Policy": readable(str(row["arm"]))} | cells)
+    return Table("Scripted policies and bounds", pd.DataFrame(numbers), pd.DataFrame(shown).fillna(NONE))
+
+
+def runs(results: Results) -> Table:
+    """Every planned run, with its status and its final return."""
+    numbers = results.runs.sort_values(["study", "arm", "seed", "run"], kind="stable")
+    finals = results.points[results.points["metric"] == FINAL][["study", "arm", "seed", "run", "value"]]
+    numbers = numbers.merge(finals, how="left", on=["study", "arm", "seed", "run"])
+    numbers = numbers[["study", "arm", "seed", "run", "status", "value", "fingerprint", "commit"]]
+    numbers = numbers.rename(columns={"value": "final_return"}).reset_index(drop=True)
+    shown = numbers.assign(final_return=[number(x) for x in numbers["final_return"]])
+    shown = shown.drop(columns=["fingerprint", "commit"]).astype(str)
+    shown.columns = pd.Index([_title(name) for name in shown.columns])
+    return Table("Runs behind the numbers", numbers, shown)
+
+
+def describe_task(env: dict[str, object]) -> str:
+    """A task in a few words: `coverage flat, 4 sensors x 5 targets`."""
+    kind = env.get("kind", "unknown task")
+    if kind == "coverage":
+        return f"coverage {env.get('preset', '')}, {env.get('agents')} sensors x {env.get('targets')} targets"
+    parts = [
+        f"{env.get('agents')} agents" if "agents" in env else "",
+        f"reward {env['reward']}" if "reward" in env else "",
+    ]
+    return ", ".join([str(kind), *filter(None, parts)])
+
+
+def readable(name: str) -> str:
+    """A policy's name for people: `free_heading_bound` is `free heading (bound)`."""
+    words = name.replace("_", " ")
+    return f"{words.removesuffix(' bound')} (bound)" if words.endswith(" bound") else words
+
+
+def seeds(results: Results, study: str, arm: str) -> str:
+    """How many seeds are finished: `3`, `2 of 3`, or `missing`."""
+    done, planned = len(results.finished(study, arm)), len(results.plan(study, arm))
+    if not planned:
+        return "missing"
+    return str(done) if done == planned else f"{done} of {planned}"
+
+
+def number(x: float, digits: int = 1) -> str:
+    """One decimal, and a minus sign that is one; a dash for NaN."""
+    return NONE if np.isnan(x) else f"{x:.{digits}f}".replace("-", "−")
+
+
+def percent(x: float) -> str:
+    """A signed percentage."""
+    return NONE if np.isnan(x) else f"{x:+.1f} %".replace("-", "−")
+
+
+def estimate(found: Interval | None, show: Callable[[float], str] = number) -> str:
+    """`66.1 [64.0, 67.9]`, without the brackets if one seed gives no interval."""
+    if found is None or np.isnan(found.value):
+        return NONE
+    if np.isnan(found.low):
+        return show(found.value)
+    return f"{show(found.value)} [{show(found.low)}, {show(found.high)}]"
+
+
+def steps(x: float) -> str:
+    """A number of steps: `150 k`, `1.5 M`."""
+    if x >= 1e6:
+        return f"{x / 1e6:.3g} M"
+    return f"{x / 1e3:.3g} k" if x >= 1e3 else f"{x:.0f}"
+
+
+def _estimates(values: NDArray[np.float64]) -> dict[str, float]:
+    found = interval(values) if len(values) else Interval(np.nan, np.nan, np.nan, 0)
+    middle = float(iqm(values)) if len(values) else np.nan
+    return _columns("mean", found) | {"iqm": middle, "seeds": found.n, "level": LEVEL}
+
+
+def _columns(name: str, found: Interval | None) -> dict[str, float]:
+    value, low, high = (found.value, found.low, found.high) if found else (np.nan, np.nan, np.nan)
+    return {name: value, f"{name}_low": low, f"{name}_high": high}
+
+
+def _with_error(value: float, error: float) -> str:
+    if np.isnan(value):
+        return NONE
+    digits = 1 if abs(value) >= 1 else 2
+    return number(value, digits) + ("" if np.isnan(error) else f" ({number(error, 2)})")
+
+
+def _title(name: str) -> str:
+    """A metric's or a column's name as a heading."""
+    return name.rpartition("/")[2].replace("_", " ").capitalize()
+
+
+def _mean(values: NDArray[np.float64]) -> float:
+    return float(values.mean()) if len(values) else -np.inf
+
+
+def _escape(text: str) -> str:
+    for sign in "%&_#":
+        text = text.replace(sign, "\\" + sign)
+    return text.replace("−", "$-$").replace("<", "$<$").replace(">", "$>$")
+
+
+def joined(names: Iterable[str]) -> str:
+    """`a`, `a and b`, `a, b and c`."""
+    listed: Sequence[str] = list(names)
+    return f"{', '.join(listed[:-1])} and {listed[-1]}" if len(listed) > 1 else "".join(listed)

@@ -1,0 +1,57 @@
+"""A tiny study, also as a program: `python -m tests.pipelines.support HOME` launches it."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from pipelines.plan import Item, items
+from pipelines.study import Resources, RunSpec, Setting, Study
+
+CODE = "c0dec0dec0de"  # a fingerprint
+
+
+def setting(**algo: Any) -> Setting:
+    """Coverage with two sensors and IQL, a fraction of a second of training."""
+    return Setting.model_validate(
+        {
+            "env": {"kind": "coverage", "preset": "flat", "agents": 2, "targets": 2},
+            "algo": {"kind": "iql", "warmup": 64, "batch": 32, "steps_per_update": 16, "hidden": 16, "buffer": 400},
+            "trainer": {"steps": 600, "num_envs": 8, "evaluations": 3, "eval_episodes": 4, "final_episodes": 8},
+        }
+        | ({"algo": {"kind": "iql", "warmup": 64, "batch": 32, **algo}} if algo else {})
+    )
+
+
+def spec(seed: int = 0, **algo: Any) -> RunSpec:
+    """A run of `setting`."""
+    return RunSpec(**dict(setting(**algo)), seed=seed)
+
+
+def tiny(name: str = "tiny", points: int = 3, arms: dict[str, Setting] | None = None, every: int = 2) -> Study:
+    """Two arms with one seed."""
+    if arms is None:
+        arms = {"slow": setting(lr=1e-4), "fast": setting(lr=1e-2)}
+    budget = {"evaluations": points, "steps": 200 * points}
+    arms = {arm: one.model_copy(update={"trainer": one.trainer.model_copy(update=budget)}) for arm, one in arms.items()}
+    return Study(
+        name=name,
+        profile="quick",
+        question="Does the whole chain hold?",
+        base=next(iter(arms.values())),
+        arms=arms,
+        seeds=1,
+        steps=200 * points,
+        resources=Resources(checkpoint_every=every),
+    )
+
+
+def plan(study: Study | None = None) -> list[Item]:
+    """Its runs under the fingerprint `CODE`."""
+    return items(study or tiny(), CODE, "abc-dirty")
+
+
+if __name__ == "__main__":
+    from pipelines import run
+
+    run.fingerprint = lambda: CODE
+    sys.exit(run.run_study(tiny(points=30), Path(sys.argv[1])))

@@ -1,0 +1,369 @@
+"""The command: what it prints, what it refuses, and what it does not import."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import pandas as pd
+import pytest
+
+from pipelines import cli
+from pipelines.fingerprint import fingerprint
+
+ROOT = Path(__file__).parents[2]
+STUDY = """\
+question: Which?
+base: {env: {kind: coverage}, algo: {kind: rhmc}}
+arms:
+  full: {}
+  none: {algo: {regulator: none}}
+seeds: 2
+steps: 1000
+"""
+
+
+class Said(NamedTuple):
+    code: int
+    out: str
+    err: str
+
+
+Rhmc = Callable[..., Said]
+
+
+@pytest.fixture
+def rhmc(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Rhmc:
+    """Calls the command in a folder that holds `studies/x.yaml`."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("RHMC_HOME", str(tmp_path / "work"))
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    (tmp_path / "studies").mkdir()
+    (tmp_path / "studies" / "x.yaml").write_text(STUDY)
+
+    def call(*words: str) -> Said:
+        monkeypatch.setattr(sys, "argv", ["rhmc", *words])
+        with pytest.raises(SystemExit) as caught:
+            cli.main()
+        return Said(int(caught.value.code or 0), *capfd.readouterr())
+
+    return call
+
+
+def imported(modules: set[str], words: list[str]) -> list[str]:
+    """Lines that the command prints in a fresh process; the last one lists those of `modules` that it imported."""
+    end = f"print(sorted({modules} & set(sys.modules)))"
+    code = f"import sys, pipelines.cli as c\ntry: c.main()\nexcept SystemExit: {end}"
+    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, cwd=ROOT, check=True)
+    return done.stdout.splitlines()
+
+
+def test_nothing_heavy_is_imported_for_help() -> None:
+    heavy = {"torch", "ray", "mlflow", "pandas", "numpy", "pyarrow", "pydantic", "matplotlib"}
+    lines = imported(heavy, ["--help"])
+    assert lines[-1] == "[]"
+    assert any("yardsticks" in line for line in lines)
+
+
+def test_reading_a_study_needs_no_ray_and_no_mlflow() -> None:
+    words = ["study", "check", "studies/coverage.yaml"]
+    assert imported({"ray", "mlflow", "pandas"}, words)[-1] == "[]"
+
+
+@pytest.mark.parametrize("words", [[], ["study"], ["yardsticks"], ["study", "run"], ["ui"], ["export"], ["report"]])
+def test_every_verb_explains_itself(rhmc: Rhmc, words: list[str]) -> None:
+    said = rhmc(*words, "--help")
+    assert (said.code, said.err) == (0, "")
+    assert "Usage: rhmc" in said.out
+
+
+# Studies
+
+
+def test_check_prints_the_plan(rhmc: Rhmc) -> None:
+    said = rhmc("study", "check", "studies/x.yaml", "--set", "trainer.num_envs=8")
+    assert (said.code, said.err) == (0, "")
+    assert "x (quick): Which?" in said.out
+    assert [line.split() for line in said.out.splitlines() if "full" in line] == [
+        ["full", "the", "base", "2", "1,000", "8"]
+    ]
+    assert "algo.regulator=none" in said.out
+    assert "4 runs, 4,000 environment steps in all" in said.out
+
+
+@pytest.mark.parametrize("verb", [["study", "check"], ["study", "run"], ["study", "status"], ["export"]])
+def test_a_faulty_study_is_refused_by_every_verb(rhmc: Rhmc, tmp_path: Path, verb: list[str]) -> None:
+    said = rhmc(*verb, "studies/x.yaml", "--set", "algo.lrr=1", "--set", "seeds=0")
+    assert (said.code, said.out) == (2, "")
+    first, second = said.err.splitlines()
+    assert first.startswith("--set algo.lrr=1: base.algo.lrr: unknown key 'lrr'; allowed: ")
+    assert first.endswith("; did you mean 'lr'?")
+    assert second == "--set seeds=0: seeds: 0 is not allowed; must be greater than or equal to 1"
+    assert not (tmp_path / "work").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["study", "check", "studies/z.yaml"], "studies/z.yaml: no such file; did you mean 'studies/x.yaml'?\n"),
+        (["study", "check", "studies"], "studies: a directory; give one study of it: x.yaml\n"),
+        (
+            ["study", "run", "studies/x.yaml", "--profile", "papr"],
+            "--profile: 'papr' is not allowed; allowed: quick, paper; did you mean 'paper'?\n",
+        ),
+        (["study", "list", "--folder", "nowhere"], "nowhere: no studies (*.yaml) here\n"),
+    ],
+)
+def test_what_cannot_be_used_is_one_line(rhmc: Rhmc, words: list[str], said: str) -> None:
+    assert rhmc(*words) == (2, "", said)
+
+
+@pytest.mark.parametrize("words", [["study", "chek"], ["study", "check"], ["--quiet"], ["ui", "--port", "0"]])
+def test_wrong_words_are_refused_without_a_traceback(rhmc: Rhmc, words: list[str]) -> None:
+    said = rhmc(*words)
+    assert (said.code, said.out) == (2, "")
+    assert "Usage: rhmc" in said.err
+    assert "Traceback" not in said.err
+
+
+def test_list_shows_questions_and_what_cannot_be_read(rhmc: Rhmc) -> None:
+    Path("studies/bad.yaml").write_text("a: [")
+    said = rhmc("study", "list")
+    lines = [line.split(None, 1) for line in said.out.splitlines() if ".yaml" in line]
+    assert said.code == 0
+    assert [line[0] for line in lines] == ["studies/bad.yaml", "studies/x.yaml"]
+    assert "not YAML" in lines[0][1]
+    assert lines[1][1].strip() == "Which?"
+
+
+@pytest.mark.parametrize("code", [0, 1, 2, 130])
+def test_run_hands_on_the_study_the_work_folder_and_the_exit_code(
+    rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, code: int
+) -> None:
+    calls: list[tuple[Any, ...]] = []
+    monkeypatch.setattr("pipelines.run.run_study", lambda *given: calls.append(given) or code)
+    assert rhmc("study", "run", "studies/x.yaml", "--profile", "paper", "--set", "seeds=1").code == code
+    ((study, home),) = calls
+    assert (study.name, study.profile, study.seeds, home) == ("x", "paper", 1, tmp_path / "work")
+
+
+def test_export_goes_to_the_folder_of_the_profile(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[tuple[Any, ...]] = []
+    monkeypatch.setattr("pipelines.export.export_study", lambda study, out: calls.append((study.name, out)) or 1)
+    assert rhmc("export", "studies/x.yaml", "--profile", "paper").code == 1
+    assert rhmc("export", "studies/x.yaml", "--out", "there").code == 1
+    assert calls == [("x", Path("reports/paper/runs")), ("x", Path("there"))]
+
+
+def test_an_interrupt_is_130(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: Any) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pipelines.run.run_study", interrupted)
+    assert rhmc("study", "run", "studies/x.yaml").code == 130
+
+
+@pytest.mark.parametrize("options", [["--profile", "paper"], ["--profile", "quick", "--runs", "a", "--out", "b"]])
+def test_report_hands_on_its_options(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch, options: list[str]) -> None:
+    calls: list[list[str]] = []
+    build = SimpleNamespace(main=lambda given: calls.append(given) or 2)
+    monkeypatch.setitem(sys.modules, "reports.build", build)
+    assert rhmc("report", *options).code == 2
+    assert calls == [options]
+
+
+# Yardsticks
+
+
+def test_yardsticks_print_one_json_object_and_nothing_else(rhmc: Rhmc) -> None:
+    said = rhmc("yardsticks", "coverage", "--episodes", "20", "--policies", "random, best_window,range_bound", "--json")
+    scores = json.loads(said.out)
+    assert (said.code, said.err, said.out.count("\n")) == (0, "", 1)
+    assert list(scores) == ["random", "best_window", "range_bound"]
+    assert set(scores["random"]) == {"coverage", "sem", "return"}
+    assert scores["random"]["coverage"] < scores["best_window"]["coverage"] < scores["range_bound"]["coverage"] < 100
+
+
+def test_yardsticks_as_a_table(rhmc: Rhmc) -> None:
+    said = rhmc("yardsticks", "navigation", "--agents", "2", "--reward", "mpe2", "--episodes", "20")
+    names = [line.split()[0] for line in said.out.splitlines() if line.strip() and "─" not in line]
+    assert names == ["policy", "random", "hold", "nearest", "matching"]
+
+
+def test_yardsticks_depend_on_the_seed_and_on_nothing_else(rhmc: Rhmc) -> None:
+    words = ["yardsticks", "navigation", "--episodes", "20", "--policies", "random", "--json"]
+    first, again, other = rhmc(*words), rhmc(*words), rhmc(*words, "--seed", "1")
+    assert first.out == again.out != other.out
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            ["--preset", "flatt"],
+            "--preset: 'flatt' is not allowed; allowed: flat, executor, coordinator; did you mean 'flat'?",
+        ),
+        (["--agents", "0"], "--agents: 0 is not allowed; must be greater than or equal to 1"),
+        (["--agents", "9"], "--agents: 9 sensors need as many boxes, and there are 6"),
+        (["--out", "studies/x.yaml"], "--out: studies/x.yaml is not a folder"),
+        (["--out", "o", "--profile", "fast"], "--profile: 'fast' is not allowed; allowed: quick, paper"),
+    ],
+)
+def test_yardsticks_refuse_what_is_no_task(rhmc: Rhmc, words: list[str], said: str) -> None:
+    assert rhmc("yardsticks", "coverage", "--json", *words) == (2, "", said + "\n")
+
+
+def test_yardsticks_name_the_nearest_policy(rhmc: Rhmc) -> None:
+    said = rhmc("yardsticks", "coverage", "--policies", "random,planer")
+    assert (said.code, said.out) == (2, "")
+    assert said.err.startswith("--policies: 'planer' is not allowed; allowed: random, hold, ")
+    assert said.err.endswith("; did you mean 'planner'?\n")
+
+
+def test_yardsticks_are_exported_beside_the_runs(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipelines.yardsticks.fingerprint", lambda: "0" * 12)
+    first = ["yardsticks", "coverage", "--episodes", "20", "--json", "--out", "o", "--policies", "hold,range_bound"]
+    scores = json.loads(rhmc(*first).out)
+    rhmc("yardsticks", "navigation", "--episodes", "20", "--out", "o", "--policies", "random")
+    values, runs = pd.read_parquet("o/yardsticks.parquet"), pd.read_parquet("o/yardsticks.runs.parquet")
+    table = values.pivot_table(index="arm", columns="metric", values="value").to_dict("index")
+    for name in ("hold", "range_bound"):
+        score = {key: table[name][f"final/{key}"] for key in ("coverage", "return", "coverage_sem")}
+        assert score == {k.replace("sem", "coverage_sem"): pytest.approx(v) for k, v in scores[name].items()}
+    assert table["random"]["final/return_sem"] > 0
+    assert sorted(runs["arm"]) == ["hold", "random", "range_bound"]
+    assert set(values["run"]) == set(runs["run"])
+    assert set(runs["fingerprint"]) == {"0" * 12}
+    assert {json.loads(config)["env"]["kind"] for config in runs["config"]} == {"coverage", "navigation"}
+
+
+def test_an_export_replaces_a_policy_of_the_same_task_and_drops_other_code(
+    rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ["yardsticks", "navigation", "--out", "o", "--policies"]
+    monkeypatch.setattr("pipelines.yardsticks.fingerprint", lambda: "0" * 12)
+    rhmc(*words, "random,hold", "--episodes", "20")
+    before = Path("o/yardsticks.parquet").read_bytes()
+    rhmc(*words, "random,hold", "--episodes", "20")
+    assert Path("o/yardsticks.parquet").read_bytes() == before
+    rhmc(*words, "random", "--episodes", "30")
+    runs = pd.read_parquet("o/yardsticks.runs.parquet").set_index("arm")["config"].map(json.loads)
+    assert {arm: config["episodes"] for arm, config in runs.items()} == {"random": 30, "hold": 20}
+    monkeypatch.setattr("pipelines.yardsticks.fingerprint", lambda: "1" * 12)
+    rhmc(*words, "nearest", "--episodes", "20")
+    assert list(pd.read_parquet("o/yardsticks.runs.parquet")["arm"]) == ["nearest"]
+    assert set(pd.read_parquet("o/yardsticks.parquet")["arm"]) == {"nearest"}
+
+
+def test_an_export_leaves_a_foreign_file_alone(rhmc: Rhmc) -> None:
+    Path("o").mkdir()
+    pd.DataFrame({"a": [1]}).to_parquet("o/yardsticks.parquet")
+    before = Path("o/yardsticks.parquet").read_bytes()
+    said = rhmc("yardsticks", "navigation", "--episodes", "2", "--policies", "hold", "--out", "o")
+    assert (said.code, said.err) == (2, "o/yardsticks.parquet: a table, but not one of yardsticks; move it away\n")
+    assert Path("o/yardsticks.parquet").read_bytes() == before
+
+
+def test_an_export_without_a_return_is_left_out(rhmc: Rhmc) -> None:
+    rhmc(
+        "yardsticks",
+        "coverage",
+        "--preset",
+        "executor",
+        "--episodes",
+        "2",
+        "--policies",
+        "hold,range_bound",
+        "--out",
+        "o",
+    )
+    assert list(pd.read_parquet("o/yardsticks.runs.parquet")["arm"]) == ["hold"]
+
+
+# The rest
+
+
+def test_fingerprint_is_printed_or_written_where_it_differs(rhmc: Rhmc) -> None:
+    text = fingerprint() + "\n"
+    assert rhmc("fingerprint") == (0, text, "")
+    assert rhmc("fingerprint", "f") == (0, "", "")
+    assert Path("f").read_text() == text
+    os.utime("f", (0, 0))
+    rhmc("fingerprint", "f")
+    assert Path("f").stat().st_mtime == 0
+
+
+def test_ui_without_a_store(rhmc: Rhmc, tmp_path: Path) -> None:
+    said = rhmc("ui")
+    assert (said.code, said.out) == (2, "")
+    assert said.err == f"{tmp_path}/work/mlflow.db: nothing is logged yet; `rhmc study run FILE` does it\n"
+
+
+def test_ui_of_a_server_elsewhere_is_its_address(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://example.org/")
+    assert rhmc("ui") == (0, "http://example.org/#/experiments?workflowType=machine_learning\n", "")
+
+
+class Server:
+    """Stands for the server's process."""
+
+    given: tuple[list[str], dict[str, str]]
+
+    def __init__(self, command: list[str], env: dict[str, str]) -> None:
+        Server.given = command, env
+        self.waits = 0
+
+    def wait(self) -> int:
+        self.waits += 1
+        if self.waits == 1:
+            raise KeyboardInterrupt
+        return -2
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Path:
+    (tmp_path / "work").mkdir()
+    file = tmp_path / "work" / "mlflow.db"
+    file.touch()
+    return file
+
+
+def test_ui_serves_the_store_on_this_machine_only_until_ctrl_c(
+    rhmc: Rhmc, store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    monkeypatch.setattr(cli, "subprocess", SimpleNamespace(Popen=Server))
+    said = rhmc("ui", "--port", str(port))
+    command, env = Server.given
+    assert said.code == 0
+    assert said.out.startswith(f"http://127.0.0.1:{port}/#/experiments?workflowType=machine_learning ")
+    options = dict(zip(command[4::2], command[5::2], strict=True))
+    assert options["--backend-store-uri"] == f"sqlite:///{store}"
+    assert (options["--host"], options["--port"], options["--workers"]) == ("127.0.0.1", str(port), "1")
+    assert env["MLFLOW_SERVER_ENABLE_JOB_EXECUTION"] == "false"
+    assert env["MLFLOW_DISABLE_TELEMETRY"] == "true"
+
+
+def test_ui_on_a_port_that_is_taken(rhmc: Rhmc, store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cli, "subprocess", None)
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        said = rhmc("ui", "--port", str(port))
+    assert said == (2, "", f"--port: {port} cannot be used (Address already in use); choose another\n")
+
+
+def test_ui_of_a_file_that_is_no_store(rhmc: Rhmc, store: Path) -> None:
+    store.write_text("something else entirely, and long enough to be looked at" * 20)
+    said = rhmc("ui")
+    assert (said.code, said.out) == (2, "")
+    assert said.err.startswith(f"{store}: not an MLflow database")
+    assert said.err.count("\n") == 1

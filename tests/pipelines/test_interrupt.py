@@ -1,0 +1,100 @@
+"""A driver that is killed or interrupted, as a process of its own; the next launch must end where one launch would."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from pipelines.export import export_study
+from pipelines.mlflow_tracker import open_existing
+from pipelines.plan import study_card
+from pipelines.run import run_study
+from pipelines.store import Home
+from tests.pipelines.support import CODE, tiny
+
+pytestmark = pytest.mark.ray
+STUDY = tiny(points=30)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def code() -> Iterator[None]:
+    """The same fingerprint in every process, should somebody edit the code meanwhile."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pipelines.run.fingerprint", lambda: CODE)
+        patch.setattr("pipelines.export.fingerprint", lambda: CODE)
+        yield
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory: pytest.TempPathFactory, template: Path, cluster: None, code: None) -> bytes:
+    """The export of a launch that nobody disturbed."""
+    home = tmp_path_factory.mktemp("whole")
+    shutil.copy(template, home / "mlflow.db")
+    assert run_study(STUDY, home) == 0
+    assert export_study(STUDY, home / "out", home) == 0
+    return (home / "out" / "tiny.parquet").read_bytes()
+
+
+def driver(home: Path) -> subprocess.Popen[str]:
+    """Launch the study in a process of its own and wait for its first checkpoint."""
+    command = [sys.executable, "-W", "ignore", "-m", "tests.pipelines.support", str(home)]
+    root = Path(__file__).parents[2]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    process = subprocess.Popen(command, cwd=root, text=True, **pipes, start_new_session=True)
+    for _ in range(12_000):  # ten minutes, for a busy machine
+        if list(home.glob("checkpoints/*/0*.pt")):
+            return process
+        assert process.poll() is None, process.communicate()[0]
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGKILL)
+    raise AssertionError(process.communicate()[0])
+
+
+def statuses(home: Path) -> dict[str, str]:
+    """Status of each run in the log."""
+    tracker = open_existing(study_card(STUDY), Home(home))
+    assert tracker is not None
+    return {run.ref: run.status for run in tracker.recorded()}
+
+
+def finish(home: Path, expected: bytes) -> None:
+    """Launch again: the same runs, whole, nothing doubled."""
+    before = statuses(home)
+    assert run_study(STUDY, home) == 0
+    after = statuses(home)
+    assert before.keys() <= after.keys()
+    assert list(after.values()) == ["finished", "finished"]
+    assert export_study(STUDY, home / "out", home) == 0
+    assert (home / "out" / "tiny.parquet").read_bytes() == expected
+    tracker = open_existing(study_card(STUDY), Home(home))
+    assert tracker is not None
+    for ref in after:
+        history = tracker.client.get_metric_history(ref, "eval/return")
+        assert sorted(value.step for value in history) == [200 * k for k in range(31)]
+    assert not list(home.glob("checkpoints/*/*.pt"))
+
+
+def test_a_killed_driver(home: Path, uninterrupted: bytes) -> None:
+    process = driver(home)
+    process.kill()
+    process.communicate()
+    assert "running" in statuses(home).values()  # nobody was left to say otherwise
+    finish(home, uninterrupted)
+
+
+def test_an_interrupted_driver(home: Path, uninterrupted: bytes) -> None:
+    process = driver(home)
+    process.send_signal(signal.SIGINT)
+    out = process.communicate(timeout=600)[0]
+    assert process.returncode == 130, out
+    assert "interrupted: each run stops at its next point" in out
+    assert "Traceback" not in out
+    assert set(statuses(home).values()) <= {"interrupted", "finished"}
+    assert not list(home.glob("checkpoints/*/*.part"))
+    finish(home, uninterrupted)

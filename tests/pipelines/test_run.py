@@ -1,0 +1,335 @@
+"""From a plan to a log: the recorder with the twin and no Ray, then the whole chain."""
+
+import io
+import os
+import threading
+from collections.abc import Callable
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+
+import pytest
+import torch
+from rich.console import Console
+from ruamel.yaml import YAML
+
+from pipelines import progress
+from pipelines.export import export_study
+from pipelines.fingerprint import fingerprint
+from pipelines.mlflow_tracker import open_existing
+from pipelines.plan import Item, study_card
+from pipelines.progress import LiveBoard, PlainBoard, duration
+from pipelines.recorder import Recorder
+from pipelines.run import run_study, show_status
+from pipelines.store import Home, StoreError
+from pipelines.tracker import MemoryRun, MemoryTracker, StudyCard, points_of
+from rhmc.algorithms import iql
+from rhmc.trainer import Trainer
+from tests.pipelines.support import plan, setting, spec, tiny
+
+STUDY = StudyCard("tiny", "quick", "")
+POINTS = [{"step": float(step), "eval/return": step / 100, "time/steps_per_second": 50.0} for step in (0, 200, 400)]
+
+Launch = Callable[..., Recorder]
+
+
+@pytest.fixture
+def shelf() -> list[MemoryRun]:
+    return []
+
+
+@pytest.fixture
+def launch(shelf: list[MemoryRun], tmp_path: Path) -> Launch:
+    """A recorder as a new launch makes it."""
+
+    def begin(runs: list[Item] | None = None, study: StudyCard = STUDY) -> Recorder:
+        tracker, board = MemoryTracker(study, shelf), PlainBoard(Console(file=io.StringIO()))
+        return Recorder(study, plan() if runs is None else runs, tracker, Home(tmp_path), board)
+
+    return begin
+
+
+def finish(recorder: Recorder, key: str) -> None:
+    """What a worker does at its end."""
+    folder = recorder.home.checkpoints(key)
+    folder.mkdir(parents=True)
+    (folder / "policy.pt").write_bytes(b"weights")
+    recorder.result(key, {"done": True, "stopped": False, "points": POINTS[1:]})
+
+
+def step(recorder: Recorder, key: str, *, stopped: bool = False) -> None:
+    """A first result."""
+    recorder.start(key)
+    recorder.result(key, {"done": stopped, "stopped": stopped, "points": POINTS[:1]})
+
+
+def test_a_finished_run_is_logged_whole_and_skipped_afterwards(launch: Launch, shelf: list[MemoryRun]) -> None:
+    recorder = launch()
+    slow, fast = [item.key for item in recorder.todo()]
+    step(recorder, slow)
+    finish(recorder, slow)
+    assert points_of(shelf[0].values) == POINTS
+    assert shelf[0].status == "finished"
+    assert shelf[0].files["policy.pt"] == b"weights"
+    assert not recorder.home.checkpoints(slow).exists()
+    assert (recorder.left, recorder.skipped) == (1, 0)
+    again = launch()
+    assert [item.key for item in again.todo()] == [fast]
+    assert again.skipped == 1
+
+
+def test_the_whole_configuration_is_kept(launch: Launch, shelf: list[MemoryRun]) -> None:
+    recorder = launch()
+    item = recorder.todo()[0]
+    step(recorder, item.key)
+    finish(recorder, item.key)
+    config = YAML(typ="safe").load(shelf[0].files["config.yaml"].decode())
+    assert {name: config[name] for name in ("env", "algo", "trainer", "seed")} == item.spec.model_dump(mode="json")
+    assert (config["arm"], config["commit"]) == ("slow", "abc-dirty")
+
+
+def test_a_stopped_run_waits_for_the_next_launch(launch: Launch, shelf: list[MemoryRun]) -> None:
+    recorder = launch()
+    key = recorder.todo()[0].key
+    step(recorder, key, stopped=True)
+    assert shelf[0].status == "interrupted"
+    assert recorder.left == 2
+    again = launch()
+    assert again.todo()[0].key == key
+    again.start(key)
+    finish(again, key)
+    assert len(shelf) == 1
+    assert points_of(shelf[0].values) == POINTS
+
+
+def test_a_failure_is_kept_and_tried_again(launch: Launch, shelf: list[MemoryRun]) -> None:
+    recorder = launch()
+    key = recorder.todo()[0].key
+    recorder.failed(key, "ValueError: no", "Traceback ... ValueError: no")
+    assert recorder.failures == {"slow s0": "ValueError: no"}
+    assert (shelf[0].status, shelf[0].tags["error"]) == ("failed", "ValueError: no")
+    assert shelf[0].files["error.txt"].startswith(b"Traceback")
+    assert launch().todo()[0].key == key
+
+
+def test_arms_that_are_the_same_run_are_trained_once(launch: Launch, shelf: list[MemoryRun]) -> None:
+    runs = plan()
+    twin = runs[0]._replace(card=runs[0].card._replace(arm="twin"))
+    recorder = launch([*runs, twin])
+    assert [item.card.arm for item in recorder.todo()] == ["slow", "fast"]
+    step(recorder, runs[0].key)
+    finish(recorder, runs[0].key)
+    assert [(run.card.arm, run.status) for run in shelf] == [("slow", "finished"), ("twin", "finished")]
+    assert points_of(shelf[1].values) == POINTS
+    assert shelf[1].tags["reused_from"] == shelf[0].ref
+
+
+def test_what_another_study_finished_is_copied(launch: Launch, shelf: list[MemoryRun]) -> None:
+    other = launch(study=STUDY._replace(study="other"))
+    key = other.todo()[0].key
+    step(other, key)
+    finish(other, key)
+    recorder = launch()
+    recorder.reuse()
+    assert [item.card.arm for item in recorder.todo()] == ["fast"]
+    assert [(run.study.study, run.status) for run in shelf] == [("other", "finished"), ("tiny", "finished")]
+    assert points_of(shelf[1].values) == POINTS
+
+
+def test_other_code_is_another_run(launch: Launch) -> None:
+    recorder = launch()
+    for item in recorder.todo():
+        step(recorder, item.key)
+        finish(recorder, item.key)
+    stale = [item._replace(card=item.card._replace(fingerprint="0ther")) for item in plan()]
+    assert launch().left == 0
+    assert launch(stale).left == 2
+
+
+def test_params_are_what_varies_and_the_seed() -> None:
+    assert [item.card.params for item in plan()] == [
+        {"algo.lr": "0.0001", "seed": "0"},
+        {"algo.lr": "0.01", "seed": "0"},
+    ]
+    kinds = plan(tiny(arms={"a": setting(), "b": setting(encoder="pairwise")}))
+    assert kinds[1].card.params["algo.encoder"] == "pairwise"
+
+
+def test_the_experiment_says_what_it_is_about() -> None:
+    note = study_card(tiny()).note
+    assert "Does the whole chain hold?" in note
+    assert "Profile `quick`: 2 arms × 1 seeds, 600 environment steps each." in note
+    assert "- slow\n- fast" in note
+
+
+# What a person sees
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(0.4, "0 s"), (59.6, "1:00"), (185, "3:05"), (3785, "1:03:05")])
+def test_durations(seconds: float, text: str) -> None:
+    assert duration(seconds) == text
+
+
+def test_plain_lines_come_at_most_every_ten_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, out = [0.0], io.StringIO()
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    board = PlainBoard(Console(file=out, width=40))
+    board.start("full s0", 1000)
+    for k in range(5):
+        now[0] = 4.0 * k
+        board.points("full s0", [{"step": 100.0 * k, "eval/return": 1.5 * k, "time/steps_per_second": 50.0}])
+    board.end("full s0", "finished")
+    assert out.getvalue().splitlines() == [
+        "full s0: started",
+        "full s0: 300 of 1,000 steps, 50 steps/s, return 4.50, 14 s left",
+        "full s0: finished, return 6.00",
+    ]
+
+
+def test_a_terminal_gets_a_line_per_running_run() -> None:
+    out = io.StringIO()
+    with LiveBoard(Console(file=out, force_terminal=True, width=120)) as board:
+        board.start("full s0", 1000)
+        board.start("full s1", 1000)
+        board.points("full s0", [{"step": 500.0, "eval/return": 2.0, "time/steps_per_second": 50.0}])
+        board.progress.refresh()
+        shown = out.getvalue()
+        board.end("full s0", "finished")
+    for part in ("full s0", "500/1,000", "50 steps/s", "return 2.00", "10 s left", "full s1", "starting"):
+        assert part in shown
+    assert "full s0: finished, return 2.00" in out.getvalue()
+
+
+# What may be in the way
+
+
+def test_a_second_driver_is_refused(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with Home(home).lock("tiny", "quick"):
+        assert run_study(tiny(), home) == 2
+    message = capsys.readouterr().err
+    assert f"tiny (quick) is already being run by process {os.getpid()}" in message
+    assert message.count("\n") == 1
+    with Home(home).lock("tiny", "paper"), Home(home).lock("tiny", "quick"):
+        pass  # another profile is free, and so is this one again
+
+
+def test_a_work_folder_that_cannot_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").touch()
+    assert run_study(tiny(), tmp_path / "file" / "work") == 2
+    message = capsys.readouterr().err
+    assert message.startswith(f"rhmc: {tmp_path}/file/work: cannot be written to: ")
+    assert message.count("\n") == 1
+
+
+def test_a_foreign_store(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "mlflow.db").write_text("not a database\n" * 100)
+    for command in (run_study, show_status):
+        assert command(tiny(), tmp_path) == 2
+        message = capsys.readouterr().err
+        assert f"{tmp_path}/mlflow.db: not an MLflow database" in message
+        assert message.count("\n") == 1
+
+
+def test_a_server_that_is_not_mlflow(
+    home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Shop(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.end_headers()
+            self.wfile.write(b"<html>flowers</html>")
+
+        def log_message(self, *args: object) -> None:
+            pass
+
+    with HTTPServer(("127.0.0.1", 0), Shop) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        uri = f"http://127.0.0.1:{server.server_port}"
+        monkeypatch.setenv("MLFLOW_TRACKING_URI", uri)
+        assert run_study(tiny(), home) == 2
+        server.shutdown()
+    message = capsys.readouterr().err
+    assert uri in message
+    assert message.count("\n") == 1
+
+
+def test_the_status_before_anything_ran(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert show_status(tiny(), tmp_path) == 1
+    assert capsys.readouterr().out.splitlines()[1].split() == ["slow", "1", "0", "0", "0", "0", "1", "0"]
+    assert list(tmp_path.iterdir()) == []
+
+
+# The whole chain
+
+
+@pytest.mark.ray
+def test_run_skip_fail_and_retry(home: Path, cluster: None, capsys: pytest.CaptureFixture[str]) -> None:
+    study = tiny()
+    slow, fast = study.runs()
+    blocked = Home(home).checkpoints(f"{slow.spec.id}-{fingerprint()}")
+    blocked.parent.mkdir()
+    blocked.touch()  # a file where the checkpoints of `slow` should go
+
+    assert run_study(study, home) == 1
+    said = capsys.readouterr()
+    assert "failed: slow s0: " in said.out
+    assert str(blocked) in said.out
+    assert "Traceback" not in said.out + said.err
+    tracker = open_existing(study_card(study), Home(home))
+    assert tracker is not None
+    before = {run.arm: run for run in tracker.recorded()}
+    assert {arm: run.status for arm, run in before.items()} == {"slow": "failed", "fast": "finished"}
+    tags = tracker.client.get_run(before["slow"].ref).data.tags
+    assert str(blocked) in tags["error"]
+    assert show_status(study, home) == 1
+
+    blocked.unlink()
+    assert run_study(study, home) == 0
+    assert "1 of 2 runs were finished before" in capsys.readouterr().out
+    after = {run.arm: run for run in tracker.recorded()}
+    assert {arm: run.ref for arm, run in after.items()} == {arm: run.ref for arm, run in before.items()}
+    assert {run.status for run in after.values()} == {"finished"}
+
+    assert run_study(study, home) == 0  # nothing to do, and Ray is not asked
+    assert show_status(study, home) == 0
+    assert not (home / "ray").exists() or not list((home / "ray").iterdir())
+
+    assert export_study(study, home / "out", home) == 0
+    trainer = Trainer(fast.spec.env, fast.spec.algo, fast.spec.trainer, fast.spec.seed)
+    expected = [(int(p["step"]), name, value) for p in trainer for name, value in p.items() if name != "step"]
+    rows = [row for row in tracker.rows([after["fast"].ref]) if not row.metric.startswith("time/")]
+    assert [(row.step, row.metric, row.value) for row in rows] == sorted(expected)
+    files = tracker.client.list_artifacts(after["fast"].ref)
+    assert sorted(file.path for file in files) == ["config.yaml", "policy.pt"]
+
+
+def test_the_kept_policy_acts(tmp_path: Path) -> None:
+    from pipelines.store import save_atomically, without_replay
+
+    one = spec(3)
+    trainer = Trainer(one.env, one.algo, one.trainer, one.seed)
+    for _ in trainer:
+        pass
+    save_atomically(tmp_path / "policy.pt", without_replay(trainer.state_dict()))
+    policy = torch.load(tmp_path / "policy.pt", weights_only=True)["algorithm"]
+    assert isinstance(one.algo, iql.Config)
+    actor = iql.IQL(one.algo, trainer.env.spec, 8, torch.Generator())
+    actor.load_state_dict(policy)
+    rng = torch.Generator()
+    wanted = trainer.algorithm.act(trainer.obs, {}, rng, explore=False)[0]
+    assert torch.equal(actor.act(trainer.obs, {}, rng, explore=False)[0], wanted)
+    assert actor.steps == 600
+
+
+@pytest.mark.ray
+def test_a_log_that_fails_stops_the_study(
+    home: Path, cluster: None, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(self: Recorder, key: str, result: object) -> None:
+        raise StoreError("the disk is full")
+
+    monkeypatch.setattr(Recorder, "result", full)
+    assert run_study(tiny(points=300), home) == 2
+    assert capsys.readouterr().err == "rhmc: the disk is full\n"
+    tracker = open_existing(study_card(tiny()), Home(home))
+    assert tracker is not None
+    assert {run.status for run in tracker.recorded()} == {"interrupted"}

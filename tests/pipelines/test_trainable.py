@@ -1,0 +1,184 @@
+"""A run as a Ray trial, driven by hand: no Ray is started."""
+
+import resource
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from pipelines.store import Checkpoints, StoreError, save_atomically, without_replay
+from pipelines.trainable import RunTrainable
+from tests.pipelines.support import spec
+
+Start = Callable[..., RunTrainable]
+
+
+def job(folder: Path, seed: int = 0, every: int = 1) -> dict[str, Any]:
+    """A worker's configuration."""
+    key = f"run{seed}"
+    fixed = {"key": key, "spec": spec(seed).canonical(), "folder": str(folder / key), "stop": str(folder / "stop")}
+    return {"job": fixed | {"checkpoint_every": every}}
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Start:
+    def begin(folder: str = "a", **options: int) -> RunTrainable:
+        return RunTrainable(job(tmp_path / folder, **options))
+
+    return begin
+
+
+def finish(run: RunTrainable) -> list[dict[str, Any]]:
+    """Step to the end."""
+    results = [run.step()]
+    while not results[-1]["done"]:
+        results.append(run.step())
+    return results
+
+
+def points(results: list[dict[str, Any]]) -> list[dict[str, float]]:
+    """What training gave, clocks aside."""
+    return [{k: v for k, v in p.items() if not k.startswith("time/")} for r in results for p in r["points"]]
+
+
+def same(a: Any, b: Any) -> bool:
+    """Whether two states are equal, bit for bit."""
+    if isinstance(a, torch.Tensor):
+        return a.dtype == b.dtype and torch.equal(a, b)
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
+    if isinstance(a, list | tuple):
+        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
+    return bool(a == b)
+
+
+def test_one_step_is_one_point_of_the_grid(start: Start) -> None:
+    results = finish(start())
+    assert [len(r["points"]) for r in results] == [1, 1, 1, 1]
+    assert [p["step"] for p in points(results)] == [0, 200, 400, 600]
+    assert [r["done"] for r in results] == [False, False, False, True]
+    assert "final/return" in points(results)[-1]
+    assert results[-1]["points"][0]["time/seconds"] == results[-1]["seconds"] > 0
+
+
+@pytest.mark.parametrize("done", [1, 2, 3])
+def test_a_continued_run_ends_in_the_same_state_and_tells_its_whole_history(start: Start, done: int) -> None:
+    whole = start("whole")
+    expected = points(finish(whole))
+    first = start("parts")
+    for _ in range(done):
+        first.step()
+    first.cleanup()
+    second = start("parts")
+    results = finish(second)
+    assert points(results) == expected
+    assert len(results) == 4 - done
+    assert second.trainer is not None
+    assert whole.trainer is not None
+    assert same(second.trainer.state_dict(), whole.trainer.state_dict())
+
+
+def test_a_run_whose_end_was_never_logged_only_tells_its_history(start: Start) -> None:
+    expected = points(finish(first := start()))
+    first.cleanup()
+    again = start()
+    result = again.step()
+    assert result["done"]
+    assert points([result]) == expected
+
+
+def test_a_truncated_checkpoint_falls_back_to_the_one_before(start: Start, tmp_path: Path) -> None:
+    expected = points(finish(start("whole")))
+    first = start()
+    for _ in range(3):
+        first.step()
+    first.cleanup()
+    files = sorted((tmp_path / "a" / "run0").glob("0*.pt"))
+    assert [file.stem for file in files] == ["00000002", "00000003"]
+    files[1].write_bytes(files[1].read_bytes()[:1000])
+    results = finish(start())
+    assert len(results[0]["points"]) == 3  # two from the checkpoint and the new one
+    assert points(results) == expected
+
+
+def test_checkpoints_come_as_often_as_asked_and_at_the_end(start: Start, tmp_path: Path) -> None:
+    run, seen = start(every=3), []
+    for _ in range(4):
+        run.step()
+        seen.append(sorted(file.name for file in (tmp_path / "a" / "run0").glob("*.pt")))
+    assert seen == [[], [], ["00000003.pt"], ["00000003.pt", "00000004.pt", "policy.pt"]]
+
+
+def test_the_policy_is_the_last_state_with_empty_replays(start: Start, tmp_path: Path) -> None:
+    run = start()
+    finish(run)
+    policy = torch.load(tmp_path / "a" / "run0" / "policy.pt", weights_only=True)
+    assert run.trainer is not None
+    state = run.trainer.state_dict()
+    assert policy["algorithm"]["replay"] == {"rows": {}, "next": 0, "size": 0}
+    assert state["algorithm"]["replay"]["size"] == 400
+    assert same(policy["algorithm"]["q"], state["algorithm"]["q"])
+    assert same(policy, without_replay(state))
+
+
+def test_a_stop_saves_the_run_at_its_next_point(start: Start, tmp_path: Path) -> None:
+    run = start(every=100)
+    run.step()
+    (tmp_path / "a" / "stop").touch()
+    result = run.step()
+    assert (result["done"], result["stopped"]) == (True, True)
+    assert start("a").step() == {"done": True, "stopped": True, "points": [], "seconds": 0.0}  # and none begins
+    run.cleanup()
+    (tmp_path / "a" / "stop").unlink()
+    assert len(start().step()["points"]) == 3
+
+
+def test_a_process_goes_on_with_the_next_run(start: Start, tmp_path: Path) -> None:
+    expected = points(finish(start("other", seed=1)))
+    run = start(seed=0)
+    run.step()
+    assert run.reset_config(job(tmp_path / "a", seed=1))
+    assert points(finish(run)) == expected
+    assert points(finish(start(seed=0)))[0]["step"] == 0  # and the first run is free
+
+
+def test_a_run_is_trained_by_one_process_at_a_time(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipelines.trainable.PATIENCE", 0.0)
+    run = start()
+    with pytest.raises(StoreError, match="another process is training this run"):
+        start()
+    run.cleanup()
+    assert len(start().step()["points"]) == 1
+
+
+def test_rays_own_checkpoints_hold_the_same(start: Start, tmp_path: Path) -> None:
+    expected = points(finish(start("whole")))
+    run = start(every=100)
+    run.step()
+    run.step()
+    run.save_checkpoint(str(tmp_path / "ray"))
+    other = start("b", every=100)
+    other.load_checkpoint(str(tmp_path / "ray"))
+    assert points(finish(other)) == expected
+    with pytest.raises(StoreError, match="no readable checkpoint"):
+        other.load_checkpoint(str(tmp_path / "nothing"))
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "x.pt"
+    save_atomically(path, {"a": 1})
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))  # as good as a full disk
+    try:
+        with pytest.raises(StoreError, match=r"x\.pt: cannot be written: File too large"):
+            save_atomically(path, {"a": torch.zeros(100_000)})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert [file.name for file in tmp_path.iterdir()] == ["x.pt"]
+    assert torch.load(path, weights_only=True) == {"a": 1}
+
+
+def test_no_checkpoint_is_no_state(tmp_path: Path) -> None:
+    assert Checkpoints(tmp_path / "none").newest() is None

@@ -1,0 +1,107 @@
+"""Made-up tables in the exported form, with everything a test may want to plant."""
+
+import json
+from collections.abc import Mapping, Sequence
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from reports.frame import POINTS, RUNS
+
+COVERAGE = {"kind": "coverage", "preset": "flat", "agents": 4, "targets": 5, "observation": "extended"}
+NAVIGATION = {"kind": "navigation", "agents": 3, "reward": "paper"}
+SCRIPTED = {
+    "random": 30.4,
+    "nearest": 60.6,
+    "best_window": 65.3,
+    "set_point": 63.9,
+    "planner": 73.9,
+    "free_heading_bound": 86.4,
+}
+KINDS = {"full": "rhmc", "no regulation": "rhmc", "no filter": "rhmc", "RHMC": "rhmc"}
+
+Tables = tuple[pd.DataFrame, pd.DataFrame]  # points, runs
+
+
+def study(
+    name: str,
+    arms: Mapping[str, Sequence[float]],
+    *,
+    env: Mapping[str, Any] = COVERAGE,
+    steps: int = 150_000,
+    points: int = 20,
+    rise: Mapping[str, float] | None = None,
+    profile: str = "quick",
+    start: float = 30.0,
+) -> Tables:
+    """A finished study.
+
+    Args:
+        arms: final return of each seed, per arm.
+        rise: per arm, the share of the budget after which the curve is at its final value; 0.5 unless given.
+    """
+    rows, plan = [], []
+    grid = np.linspace(0, steps, points + 1).round().astype(int)
+    for arm, finals in arms.items():
+        for seed, final in enumerate(finals):
+            config = {"algo": {"kind": KINDS.get(arm, arm.lower()), "arm": arm}, "env": dict(env), "seed": seed}
+            config |= {"trainer": {"steps": steps, "evaluations": points}}
+            run = sha256(json.dumps([name, config], sort_keys=True).encode()).hexdigest()[:12]
+            key = {"study": name, "arm": arm, "seed": seed, "run": run}
+            share = np.minimum(1, grid / steps / (rise or {}).get(arm, 0.5))
+            wobble = np.random.default_rng(seed).normal(size=len(grid)) * (share < 1)
+            for step, value in zip(grid, start + (final - start) * share + wobble, strict=True):
+                rows.append(key | {"step": int(step), "metric": "eval/return", "value": float(value)})
+            rows.append(key | {"step": steps, "metric": "final/return", "value": float(final)})
+            rows.append(key | {"step": steps, "metric": "final/coverage", "value": float(final) + 0.1})
+            about = {
+                "algorithm": KINDS.get(arm, arm.lower()),
+                "task": env["kind"],
+                "config": json.dumps(config, sort_keys=True),
+            }
+            about |= {"fingerprint": "0123456789ab", "commit": "c0ffee", "question": "Which?", "seconds": 1.5}
+            plan.append(key | {"status": "finished", "profile": profile} | about)
+    return pd.DataFrame(rows, columns=list(POINTS)), pd.DataFrame(plan, columns=list(RUNS))
+
+
+def yardsticks(
+    values: Mapping[str, float] = SCRIPTED, env: Mapping[str, Any] = COVERAGE, profile: str = "quick"
+) -> Tables:
+    """Scripted policies, standard error 0.3."""
+    points, runs = study("yardsticks", {name: [value] for name, value in values.items()}, env=env, profile=profile)
+    points = points[points["metric"].str.startswith("final/")].assign(step=0)
+    errors = points.assign(metric=points["metric"] + "_sem", value=0.3)
+    task = {k: v for k, v in env.items() if k != "observation"} | {"observation": "paper"}
+    ids = {run: f"y{n:03d}{env['kind'][:4]}" for n, run in enumerate(runs["run"])}
+    points = pd.concat([points, errors], ignore_index=True)
+    points["run"] = points["run"].map(ids)
+    return points, runs.assign(config=json.dumps({"env": task}), run=runs["run"].map(ids))
+
+
+def theorem(lost: int = 40) -> Tables:
+    """Algorithm 1 against the optimum on two families of instances."""
+    rows = [
+        ("theorem", arm, 0, f"t{n}", 0, f"theorem/{metric}", value)
+        for n, arm in enumerate(("4 x 3 x 5", "4 x 5 x 8"))
+        for metric, value in (("instances", 1000.0), ("lost", float(lost * (n + 1))), ("max_gap", 1.1 if lost else 0.0))
+    ]
+    return pd.DataFrame(rows, columns=list(POINTS)), pd.DataFrame(columns=list(RUNS))
+
+
+def write(folder: Path, *tables: Tables) -> Path:
+    """Write tables as an export does, one pair of files per study."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for points, runs in tables:
+        name = [*runs["study"], *points["study"]][0]
+        points.to_parquet(folder / f"{name}.parquet", index=False)
+        if len(runs):
+            runs.to_parquet(folder / f"{name}.runs.parquet", index=False)
+    return folder
+
+
+def noisy(mean: float, n: int = 3, spread: float = 1.0) -> list[float]:
+    """n values of that mean, evenly spread over mean - spread .. mean + spread."""
+    return [float(x) for x in np.linspace(mean - spread, mean + spread, n)]

@@ -1,0 +1,244 @@
+"""Each rule on planted results, both ways."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from reports.claims import Claim, judge
+from reports.frame import load
+from reports.paper import read
+from reports.stats import Interval
+from tests.reports.factory import COVERAGE, NAVIGATION, Tables, noisy, study, theorem, write, yardsticks
+
+pytestmark = pytest.mark.usefixtures("quick_resampling")
+
+PAPER = 5_000_000  # steps
+Arms = Mapping[str, Sequence[float]]
+OTHERS = {"HiT-MAC": 60.0, "QMIX": 61.0, "IQL": 58.0, "COMA": 50.0, "MAPPO": 55.0, "MADDPG": 45.0}
+
+
+def verdicts(folder: Path, *tables: Tables) -> dict[str, Claim]:
+    return {claim.id: claim for claim in judge(load(write(folder, *tables), "quick"), read())}
+
+
+def arms(level: float, others: Mapping[str, float] = OTHERS, n: int = 5) -> Arms:
+    return {"RHMC": noisy(level, n), **{arm: noisy(x, n) for arm, x in others.items()}}
+
+
+def ablation(full: float, regulation: float, filtering: float, n: int = 5, **how: object) -> Tables:
+    finals = {"full": noisy(full, n), "no regulation": noisy(regulation, n), "no filter": noisy(filtering, n)}
+    return study("ablation", finals, steps=PAPER, **how)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("without", "verdict"),
+    [
+        (35.6, "reproduced"),
+        (41.0, "reproduced"),  # -41.8 %: within ten points of -49.5 %
+        (55.0, "partly"),
+        (69.9, "not reproduced"),  # less, by less than the noise
+        (75.0, "not reproduced"),
+    ],
+)
+def test_c8_and_c9(tmp_path: Path, without: float, verdict: str) -> None:
+    found = verdicts(tmp_path, ablation(70.5, without, 70.5 - (70.5 - without) * 15.4 / 34.9))
+    assert found["C8"].verdict == verdict
+    assert found["C8"].ours["full − no regulation"].value == pytest.approx(70.5 - without)
+    assert not found["C8"].provisional
+    assert len(found["C8"].runs) == 10
+    if verdict == "reproduced":
+        assert found["C9"].verdict == verdict
+
+
+def test_the_stated_share_stands_beside_the_recomputed_one(tmp_path: Path) -> None:
+    reason = verdicts(tmp_path, ablation(70.5, 35.6, 55.1))["C9"].reason
+    assert "−21.8 %" in reason
+    assert "−21.4 %" in reason
+
+
+@pytest.mark.parametrize(
+    ("level", "others", "verdict"),
+    [
+        (70.5, OTHERS, "reproduced"),
+        (66.0, OTHERS, "reproduced"),
+        (64.0, OTHERS, "partly"),  # first, but not near 70
+        (70.0, OTHERS | {"IQL": 72.0}, "partly"),  # near 70, but not first
+        (70.0, OTHERS | {"VDN": 69.8}, "partly"),  # no clear lead over a method the paper does not have
+        (50.0, OTHERS, "not reproduced"),
+        (70.5, {"IQL": 58.0}, "untestable"),  # ahead of all that were run, and most were not
+        (70.5, {"IQL": 75.0}, "partly"),  # beaten already: the missing ones cannot change that
+    ],
+)
+def test_c3(tmp_path: Path, level: float, others: Mapping[str, float], verdict: str) -> None:
+    found = verdicts(tmp_path, study("coverage", arms(level, others), steps=PAPER))["C3"]
+    assert found.verdict == verdict
+    if verdict == "untestable":
+        assert found.reason.endswith("no results of HiT-MAC, QMIX, COMA, MAPPO and MADDPG.")
+
+
+def test_c1_and_c2(tmp_path: Path) -> None:
+    levels = {"HiT-MAC": -30.0, "QMIX": -40.0, "IQL": -35.0, "COMA": -45.0, "MAPPO": -30.0, "MADDPG": -36.0}
+
+    def found(name: str, level: float, changed: dict[str, float]) -> dict[str, Claim]:
+        table = study("navigation", arms(level, levels | changed), env=NAVIGATION, start=-60)
+        return verdicts(tmp_path / name, table)
+
+    as_said = found("said", -25, {})
+    assert [as_said[name].verdict for name in ("C1", "C2")] == ["reproduced", "reproduced"]
+    assert as_said["C2"].ours["QMIX − IQL"].value == pytest.approx(-5)
+    assert found("half", -25, {"COMA": -20.0})["C2"].verdict == "partly"
+    turned = found("turned", -33, {"QMIX": -20.0, "COMA": -20.0})
+    assert [turned[name].verdict for name in ("C1", "C2")] == ["not reproduced", "not reproduced"]
+    assert "QMIX" in turned["C1"].reason
+    assert "IQL" not in turned["C1"].reason  # RHMC is above it
+
+
+@pytest.mark.parametrize(("qmix", "verdict"), [(62.0, "reproduced"), (70.0, "partly")])
+def test_c4(tmp_path: Path, qmix: float, verdict: str) -> None:
+    table = study("coverage", arms(70, OTHERS | {"QMIX": qmix}), steps=PAPER)
+    assert verdicts(tmp_path, table)["C4"].verdict == verdict
+    low = study("coverage", arms(70, OTHERS | {"QMIX": qmix + 20, "HiT-MAC": 30.0}), steps=PAPER)
+    assert verdicts(tmp_path / "low", low)["C4"].verdict == "not reproduced"
+
+
+def peaked(table: Tables, arms: Sequence[str], step: int) -> Tables:
+    """Give the curves of some arms a peak."""
+    points, runs = table
+    top = points["arm"].isin(arms) & (points["metric"] == "eval/return") & (points["step"] == step)
+    return points.assign(value=points["value"] + 20.0 * top), runs
+
+
+def test_c5(tmp_path: Path) -> None:
+    plain = study("coverage", arms(70), steps=PAPER)
+    early = peaked(plain, ["MADDPG", "MAPPO"], 1_500_000)
+    found = verdicts(tmp_path / "early", early)["C5"]
+    assert found.verdict == "reproduced"
+    assert found.ours["MAPPO: highest at step"].value == 1_500_000
+    late = peaked(plain, ["MADDPG", "MAPPO"], 4_000_000)
+    assert verdicts(tmp_path / "late", late)["C5"].verdict == "partly"
+    best = study("coverage", arms(40), steps=PAPER)
+    best = peaked(best, ["MADDPG", "MAPPO"], 4_000_000)
+    assert verdicts(tmp_path / "best", best)["C5"].verdict == "not reproduced"
+    short = verdicts(tmp_path / "short", study("coverage", arms(70), steps=150_000))["C5"]
+    assert short.verdict == "untestable"
+    assert "150 k steps" in short.reason
+
+
+def test_c6(tmp_path: Path) -> None:
+    def verdict(name: str, level: float, rise: Mapping[str, float]) -> str:
+        return verdicts(tmp_path / name, study("coverage", arms(level), steps=PAPER, rise=rise))["C6"].verdict
+
+    assert verdict("fast", 70, {"RHMC": 0.2}) == "reproduced"
+    assert verdict("high", 90, {"RHMC": 0.6}) == "partly"  # more area, more steps
+    assert verdict("slow", 70, {"RHMC": 1.0}) == "not reproduced"
+
+
+def sensors(ours: Sequence[float], theirs: Sequence[float]) -> Tables:
+    """RHMC and IQL at 2, 3, ... sensors."""
+    parts = [
+        study(
+            "sensors",
+            {f"RHMC, {n}": noisy(x, 5), f"IQL, {n}": noisy(y, 5)},
+            env=COVERAGE | {"agents": n},
+            steps=PAPER,
+        )
+        for n, (x, y) in enumerate(zip(ours, theirs, strict=True), start=2)
+    ]
+    points, runs = (pd.concat([part[k] for part in parts], ignore_index=True) for k in (0, 1))
+    return points, runs.assign(algorithm=runs["arm"].str.split(",").str[0].str.lower())
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "verdict"),
+    [
+        ([50, 60, 70], [40, 50, 60], "reproduced"),
+        ([50, 60, 50], [40, 50, 40], "partly"),  # falls when a sensor is added
+        ([50, 60, 70], [40, 65, 60], "partly"),
+        ([50, 60, 50], [40, 65, 40], "not reproduced"),
+    ],
+)
+def test_c7(tmp_path: Path, ours: Sequence[float], theirs: Sequence[float], verdict: str) -> None:
+    assert verdicts(tmp_path, sensors(ours, theirs))["C7"].verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("full", "filtering", "verdict"),
+    [
+        (0.15, 0.5, "reproduced"),
+        (0.5, 0.9, "partly"),  # in order, both too late
+        (0.1, 0.1, "partly"),  # both in time, no difference
+        (0.9, 0.5, "not reproduced"),
+    ],
+)
+def test_c10(tmp_path: Path, full: float, filtering: float, verdict: str) -> None:
+    found = verdicts(tmp_path, ablation(70, 60, 65, points=100, rise={"full": full, "no filter": filtering}))["C10"]
+    assert found.verdict == verdict
+    # The rise is linear from 30, so 95 % of 70 are there at 36.5/40 of it.
+    assert found.ours["full: steps"].value == pytest.approx(full * PAPER * 36.5 / 40, rel=0.12)
+
+
+def test_c10_needs_the_budget(tmp_path: Path) -> None:
+    short = study("ablation", {"full": noisy(70), "no filter": noisy(60)}, steps=150_000)
+    assert verdicts(tmp_path, short)["C10"].verdict == "untestable"
+
+
+def test_c11_and_c12_are_decided_by_the_text_and_the_bound(tmp_path: Path) -> None:
+    with_bound = verdicts(tmp_path / "bound", study("coverage", arms(70)), yardsticks())
+    assert [with_bound[name].verdict for name in ("C11", "C12")] == ["contradicted by the paper itself"] * 2
+    assert "92.1 is above the 86.4" in with_bound["C12"].reason
+    assert with_bound["C12"].ours["bound with free headings"].low == pytest.approx(85.8)
+    loose = verdicts(tmp_path / "loose", study("coverage", arms(70)), yardsticks({"free_heading_bound": 95.0}))
+    assert "92.1 is not above the 95.0" in loose["C12"].reason
+    assert "not computed" in verdicts(tmp_path / "none", study("coverage", arms(70)))["C12"].reason
+
+
+def test_c11_and_c12_follow_the_numbers(tmp_path: Path) -> None:
+    paper = read()
+    claims = dict(paper.claims)
+    claims["C11"] = claims["C11"].model_copy(update={"numbers": {"RHMC": -25.0, "QMIX": -30.0}})
+    claims["C12"] = claims["C12"].model_copy(update={"numbers": {"RHMC": 70.0, "QMIX": 61.0, "COMA": 50.0}})
+    results = load(write(tmp_path, study("coverage", arms(70))), "quick")
+    found = {claim.id: claim for claim in judge(results, paper.model_copy(update={"claims": claims}))}
+    assert [found[name].verdict for name in ("C11", "C12")] == ["untestable", "untestable"]
+
+
+@pytest.mark.parametrize(("lost", "verdict"), [(40, "not reproduced"), (0, "reproduced")])
+def test_c13(tmp_path: Path, lost: int, verdict: str) -> None:
+    found = verdicts(tmp_path, study("coverage", arms(70)), theorem(lost))["C13"]
+    assert found.verdict == verdict
+    assert found.ours["4 x 5 x 8: % lost"].value == pytest.approx(lost / 5)
+    assert not found.provisional  # rests on no training
+
+
+def test_without_the_runs_nothing_is_decided(tmp_path: Path) -> None:
+    found = verdicts(tmp_path, study("other", {"a": [1.0, 2.0]}))
+    decided = {name for name, claim in found.items() if claim.verdict != "untestable"}
+    assert decided == {"C11", "C12"}  # by the text
+    assert found["C8"].reason == "Arm full of study ablation is missing."
+    assert list(found) == [f"C{n}" for n in range(1, 14)]
+    assert all(claim.rule and claim.reason for claim in found.values())
+
+
+def test_one_seed_decides_nothing(tmp_path: Path) -> None:
+    found = verdicts(tmp_path, study("ablation", {"full": [70.5], "no regulation": [35.6]}))["C8"]
+    assert found.verdict == "untestable"
+    assert found.reason == "Arm full of study ablation has one finished seed, and an interval needs two."
+
+
+def test_small_budget_and_few_seeds_make_it_provisional(tmp_path: Path) -> None:
+    finals = {"full": noisy(70.5), "no regulation": noisy(35.6)}
+    points, runs = study("ablation", finals, steps=150_000)
+    runs["status"] = ["finished"] * 5 + ["partial"]
+    found = verdicts(tmp_path, (points, runs))["C8"]
+    assert found.verdict == "reproduced"
+    assert found.judgement == "reproduced (provisional)"
+    assert found.caveats == ("150 k of the paper's 5 M steps (3 %)", "2 seeds", "unfinished: no regulation")
+    assert len(found.runs) == 5
+
+
+def test_an_interval_that_is_none_decides_nothing() -> None:
+    nothing = Interval(5.0, float("nan"), float("nan"), 1)
+    assert not nothing.above(0)
+    assert not nothing.below(9)
