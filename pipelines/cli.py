@@ -251,6 +251,29 @@ def _env(kind: str, fields: dict[str, Any]) -> Any:
 # The rest
 
 
+@app.command("theorem")
+def theorem(
+    instances: Annotated[int, typer.Option(min=1, help="Random instances per size and density.")] = 20_000,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    alpha: Annotated[float, typer.Option(min=0, max=1, help="The penalty of Eq. 6.")] = 0.1,
+    out: Annotated[Path | None, typer.Option(help="Also write theorem.parquet in this folder.")] = None,
+) -> None:
+    """Put Theorem 1 to the test: Algorithm 1 against the optimum, and the smallest instances where it fails."""
+    from pipelines.store import StoreError
+    from pipelines.theorem import export_theorem
+    from rhmc.theorem import shortfall_table, summary
+
+    if out is not None and out.exists() and not out.is_dir():
+        raise InputError(f"--out: {out} is not a folder")
+    table = shortfall_table(instances, seed, alpha=alpha)
+    print(summary(table, alpha))
+    try:
+        if out is not None:
+            print(f"wrote {export_theorem(table, seed, out)}", file=sys.stderr)
+    except StoreError as error:
+        raise InputError(str(error)) from error
+
+
 @app.command("fingerprint")
 def fingerprint(file: Annotated[Path | None, typer.Argument(help="Write it there, if it differs.")] = None) -> None:
     """Name the code that decides results: the same after editing a comment, another after editing behaviour."""

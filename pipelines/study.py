@@ -56,7 +56,7 @@ class Setting(Frozen):
 class RunSpec(Setting):
     """All that decides a run's result, the code and its libraries aside."""
 
-    seed: int = Field(ge=0)
+    seed: int = Field(ge=0, lt=1_000_000)  # the evaluation banks' generators are seeded from 10 million on
 
     @property
     def id(self) -> str:
@@ -297,7 +297,22 @@ def _setting(layers: Sequence[Node], steps: Node | None) -> tuple[Setting | None
             parts[section], found = _trainer(node, steps) if section == "trainer" else _of_kind(section, node)
             faults += found
     complete = len(parts) == len(SECTIONS) and all(part is not None for part in parts.values())
-    return (Setting(**parts) if complete and not faults else None), faults
+    if not complete or faults:
+        return None, faults
+    setting = Setting(**parts)
+    faults = _misfit(setting, layers)
+    return (None if faults else setting), faults
+
+
+def _misfit(setting: Setting, layers: Sequence[Node]) -> list[Fault]:
+    """A method that cannot act in its task, at the place of the task's field that it cannot do with."""
+    text = trainer.misfit(setting.env, setting.algo)
+    if not text:
+        return []
+    field, _, fault = text.partition(": ")
+    env = _section(layers, "env")
+    node = _child(env, field) or env
+    return [Fault(node.place, node.path, fault)] if node else []
 
 
 def _section(layers: Sequence[Node], name: str) -> Node | None:

@@ -83,7 +83,7 @@ class Executor:
 
     def _straight_through(self, logits: Tensor) -> Tensor:
         soft = (logits + gumbel(logits.shape, self.rng)).softmax(-1)
-        return self._one_hot(soft.argmax(-1)) + soft - soft.detach()
+        return self._one_hot(soft.argmax(-1)) + (soft - soft.detach())
 
     def _seen(self, obs: Obs, assignment: Tensor) -> Obs:
         return _told(obs._replace(pairs=self.filter(obs.pairs, assignment)), assignment)

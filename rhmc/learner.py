@@ -82,7 +82,7 @@ class Learner(Generic[Net]):
         return norm
 
     def state_dict(self) -> State:
-        """Network, slow copy and optimiser."""
+        """Network, slow copy and optimiser, live: write them out before the next update."""
         return {
             "net": self.net.state_dict(),
             "slow": self.slow.state_dict(),

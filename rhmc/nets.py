@@ -1,7 +1,7 @@
 """Networks over an observation, in two encoders with the same three shapes.
 
 `local`: each agent from its own row. `central`: each agent from everything, with joint actions. `pairs`: each (agent,
-target) pair from everything. The encoder `mlp` is the paper's fully connected layer on padded, flattened features with
+target) pair from all pairs. The encoder `mlp` is the paper's fully connected layer on padded, flattened features with
 a one-hot agent id; `pairwise` shares one network over all (agent, target) pairs and pools, so that its weights act for
 any N and M.
 """

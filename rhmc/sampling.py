@@ -24,4 +24,4 @@ def relaxed_bernoulli(logits: Tensor, rng: Generator) -> Tensor:
     """0 or 1 drawn from logits, with the gradient of the relaxed draw (Maddison et al. 2017, temperature 1)."""
     u = torch.rand(logits.shape, generator=rng, device=rng.device).clamp(1e-6, 1 - 1e-6)
     soft = (logits + u.logit()).sigmoid()
-    return (soft > 0.5).float() + soft - soft.detach()
+    return (soft > 0.5).float() + (soft - soft.detach())

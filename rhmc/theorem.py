@@ -1,9 +1,8 @@
-"""How often Algorithm 1 falls short of the optimum that Theorem 1 promises: `python -m rhmc.theorem`.
+"""How often Algorithm 1 falls short of the optimum that Theorem 1 promises: `rhmc theorem`.
 
 Sizes are written agents x options x targets.
 """
 
-import argparse
 from collections.abc import Iterator, Sequence
 from itertools import count, product
 from typing import Literal, NamedTuple
@@ -119,18 +118,17 @@ def describe(case: Instance) -> str:
     return "\n".join(lines)
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    """Print the table and the smallest counterexamples."""
-    parser = argparse.ArgumentParser(prog="python -m rhmc.theorem", description=main.__doc__)
-    parser.add_argument("--instances", type=int, default=20_000, help="per row (default 20000)")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--alpha", type=float, default=0.1, help="penalty of Eq. 6 (default 0.1)")
-    args = parser.parse_args(argv)
-    print(markdown(shortfall_table(args.instances, args.seed, alpha=args.alpha)))
-    print("\nSmallest instance where Algorithm 1 earns less than the optimum:\n")
-    print(describe(smallest_counterexample(args.alpha)))
-    print("\nSmallest instance where Algorithm 1 completes fewer targets than possible:\n")
-    print(describe(smallest_counterexample(args.alpha, by="count")))
+def summary(rows: Sequence[Shortfall], alpha: float) -> str:
+    """The table and the smallest counterexamples, as Markdown."""
+    return "\n".join(
+        (
+            markdown(rows),
+            "\nSmallest instance where Algorithm 1 earns less than the optimum:\n",
+            describe(smallest_counterexample(alpha)),
+            "\nSmallest instance where Algorithm 1 completes fewer targets than possible:\n",
+            describe(smallest_counterexample(alpha, by="count")),
+        )
+    )
 
 
 def _shortfall(instances: int, seed: int, size: Size, coverage: float, assignment: float, alpha: float) -> Shortfall:
@@ -176,7 +174,3 @@ def _every(shape: tuple[int, ...]) -> Tensor:
 
 def _digits(members: Tensor | Sequence[bool]) -> str:
     return "".join(str(int(x)) for x in members)
-
-
-if __name__ == "__main__":
-    main()

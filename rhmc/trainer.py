@@ -35,6 +35,9 @@ class Trainer:
         algo: the method, one of the configurations in `ALGORITHMS`.
         cfg: budget and evaluation.
         seed: decides everything random in training.
+
+    Raises:
+        ValueError: the method cannot act in the task.
     """
 
     def __init__(self, env: EnvConfig, algo: Any, cfg: Config, seed: int) -> None:
@@ -43,6 +46,8 @@ class Trainer:
         streams = [torch.Generator(device).manual_seed(4 * seed + k) for k in range(3)]
         env_rng, self.act_rng, learn_rng = streams
         self.env = make_env(env, cfg.num_envs, env_rng)
+        if fault := misfit(env, algo):
+            raise ValueError(fault)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(4 * seed + 3)
             self.algorithm = ALGORITHMS[algo.kind][1](algo, self.env.spec, cfg.num_envs, learn_rng)
@@ -142,6 +147,13 @@ class Means:
     def result(self) -> Metrics:
         """The mean of each key."""
         return {key: float(value) / self.counts[key] for key, value in self.sums.items()}
+
+
+def misfit(env: EnvConfig, algo: Any) -> str:
+    """Why the method cannot act in the task, or nothing."""
+    if getattr(env, "continuous", False) and not ALGORITHMS[algo.kind][1].continuous:
+        return f"continuous: '{algo.kind}' chooses among discrete actions; allowed: false"
+    return ""
 
 
 def grid_step(cfg: Config, point: int) -> int:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from rhmc.regulation import MOST_TARGETS, REGULATORS, algorithm1_path, executed, high_level_reward, optimal_path
-from rhmc.theorem import CROWDED, main, random_instances, shortfall_table, smallest_counterexample
+from rhmc.theorem import CROWDED, random_instances, shortfall_table, smallest_counterexample, summary
 from tests.oracles import regulation as oracle
 
 B = 5  # instances per drawn shape
@@ -266,9 +266,8 @@ def test_shortfall_is_seeded_and_there_at_the_sizes_of_the_paper() -> None:
     assert crowded.share > 0.15
 
 
-def test_command_prints_the_table_and_the_counterexamples(capsys: pytest.CaptureFixture[str]) -> None:
-    main(["--instances", "50", "--seed", "1"])
-    out = capsys.readouterr().out
+def test_summary_has_the_table_and_the_counterexamples() -> None:
+    out = summary(shortfall_table(50, seed=1), alpha=0.1)
     assert out.count("| 4 x 13 x 5 ") == 4
     assert "2 x 2 x 2" in out
     assert "3 x 2 x 2" in out

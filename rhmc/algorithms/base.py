@@ -1,6 +1,6 @@
 """What the trainer expects of an algorithm."""
 
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 from torch import Generator, Tensor
 
@@ -12,8 +12,12 @@ Carry = Batch  # what an acting policy remembers between steps, tensors with lea
 class Algorithm(Protocol):
     """A learner that acts. Built as `Algorithm(cfg, spec, num_envs, rng)`; `rng` samples while learning.
 
+    `continuous` tells whether it can act in a task of continuous actions (the trainer asks).
+
     Network weights are drawn from torch's global generator, which the trainer seeds around the construction.
     """
+
+    continuous: ClassVar[bool]
 
     def carry(self, batch: int) -> Carry:
         """Memory at the start of `batch` episodes."""

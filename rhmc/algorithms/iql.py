@@ -37,7 +37,9 @@ class Config(Frozen):
 
 
 class IQL:
-    """See the module."""
+    """See the module. Discrete actions only."""
+
+    continuous = False
 
     def __init__(self, cfg: Config, spec: Spec, num_envs: int, rng: Generator) -> None:
         self.cfg, self.spec, self.num_envs, self.rng = cfg, spec, num_envs, rng

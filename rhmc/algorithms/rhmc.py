@@ -33,7 +33,9 @@ class Config(coordinator.Config, executor.Config):
 
 
 class RHMC:
-    """See the module. Assignments are (B, N, M) float, 0 or 1."""
+    """See the module. Discrete actions only. Assignments are (B, N, M) float, 0 or 1."""
+
+    continuous = False
 
     def __init__(self, cfg: Config, spec: Spec, num_envs: int, rng: Generator) -> None:
         self.cfg, self.spec, self.rng = cfg, spec, rng
@@ -85,9 +87,10 @@ class RHMC:
         return rows | {"reward": torch.maximum(earned, p["bound"]), "earned": earned, "terminal": t.terminal}
 
     def update(self) -> Batch:
-        """One update of both levels for every `steps_per_update` steps since the warm-up."""
+        """One update of both levels for every `steps_per_update` steps since the warm-up, once a period has ended."""
         logs: Batch = {}
-        while self.updates < (self.steps - self.cfg.warmup) // self.cfg.steps_per_update:
+        due = (self.steps - self.cfg.warmup) // self.cfg.steps_per_update if self.high.size else 0
+        while self.updates < due:
             logs = self.executor.update(self.low.sample(self.cfg.batch))
             logs |= self.coordinator.update(self.high.sample(self.cfg.batch_h))
             self.updates += 1

@@ -454,3 +454,15 @@ def test_an_id_does_not_depend_on_how_the_study_is_written() -> None:
     assert ids(changed("agents: 4", "agents: 4, targets: 5")) == ids(GOOD)  # the default, written out
     assert ids(GOOD + "resources: {concurrent: 1}") == ids(GOOD)
     assert not set(ids(changed("steps: 1000", "steps: 1001"))) & set(ids(GOOD))
+
+
+def test_a_method_that_cannot_act_in_its_task_is_named_where_the_task_says_so(tmp_path: Path) -> None:
+    file = tmp_path / "x.yaml"
+    file.write_text(
+        "question: q\nbase:\n  env: {kind: navigation, continuous: true}\n  algo: {kind: rhmc}\n"
+        "arms: {a: {}, b: {algo: {lr: 1e-3}}}\nseeds: 1\nsteps: 1000\n"
+    )
+    with pytest.raises(StudyError) as error:
+        Study.load(file)
+    place = f"{file}:3:39: base.env.continuous"
+    assert str(error.value) == f"{place}: 'rhmc' chooses among discrete actions; allowed: false"
