@@ -29,7 +29,8 @@ class Config(coordinator.Config, executor.Config):
     assignment_period: int = Field(1, ge=1, description="steps for which an assignment is held")
     buffer: int = Field(50_000, ge=1, description="rows kept at each level")
     warmup: int = Field(2_000, ge=0, description="environment steps before the first update")
-    steps_per_update: int = Field(64, ge=1, description="environment steps collected for each update of both levels")
+    steps_per_update: int = Field(64, ge=1, description="environment steps collected for each update of the executors")
+    coordinator_every: int = Field(1, ge=1, description="updates of the executors for each one of the coordinator")
 
 
 class RHMC:
@@ -87,12 +88,16 @@ class RHMC:
         return rows | {"reward": torch.maximum(earned, p["bound"]), "earned": earned, "terminal": t.terminal}
 
     def update(self) -> Batch:
-        """One update of both levels for every `steps_per_update` steps since the warm-up, once a period has ended."""
+        """One update of the executors for every `steps_per_update` steps since the warm-up, once a period has ended.
+
+        Every `coordinator_every` of them, one of the coordinator.
+        """
         logs: Batch = {}
         due = (self.steps - self.cfg.warmup) // self.cfg.steps_per_update if self.high.size else 0
         while self.updates < due:
-            logs = self.executor.update(self.low.sample(self.cfg.batch))
-            logs |= self.coordinator.update(self.high.sample(self.cfg.batch_h))
+            logs |= self.executor.update(self.low.sample(self.cfg.batch))
+            if self.updates % self.cfg.coordinator_every == 0:
+                logs |= self.coordinator.update(self.high.sample(self.cfg.batch_h))
             self.updates += 1
         return logs
 
