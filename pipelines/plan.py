@@ -18,11 +18,12 @@ class Item(NamedTuple):
 
     card: Card
     spec: RunSpec
+    study: str
 
     @property
     def name(self) -> str:
         """What a person calls it."""
-        return f"{self.card.arm} s{self.card.seed}"
+        return f"{self.study} / {self.card.arm} s{self.card.seed}"
 
     @property
     def key(self) -> str:
@@ -40,7 +41,7 @@ def items(study: Study, fingerprint: str, commit: str) -> list[Item]:
         params = {name: str(flat[name]) for name in varying if name in flat} | {"seed": str(spec.seed)}
         algorithm, task = spec.algo.kind, spec.env.kind
         card = Card(run.arm, spec.seed, spec.id, fingerprint, algorithm, task, commit, params)
-        planned.append(Item(card, spec))
+        planned.append(Item(card, spec, study.name))
     return planned
 
 

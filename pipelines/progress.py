@@ -181,4 +181,6 @@ def print_table(console: Console, header: list[str], rows: list[list[str]]) -> N
         table.add_column(title, justify="right" if place else "left", no_wrap=True)
     for row in rows:
         table.add_row(*row)
+    if not console.is_terminal:  # nothing to fit into: no column is cut
+        console.width = max(console.width, console.measure(table).maximum)
     console.print(table)

@@ -13,7 +13,7 @@ from reports import claims as rules
 from reports import figures, tables
 from reports.claims import VERDICTS, Claim
 from reports.frame import Results, TableError, load
-from reports.paper import Paper, read
+from reports.paper import Curves, Paper, read
 from reports.stats import FEW
 from reports.tables import Table, joined, steps
 
@@ -73,7 +73,7 @@ def _write(results: Results, paper: Paper, folder: Path) -> None:
     pictures.mkdir()
     sheets.mkdir()
     drawn = {}
-    for name, spec in paper.figures.items():
+    for name, spec in _figures(results, paper).items():
         drawing = figures.learning_curves(results, spec)
         if drawing:
             figures.save(drawing, pictures, name)
@@ -88,8 +88,16 @@ def _write(results: Results, paper: Paper, folder: Path) -> None:
         json.dumps([_plain(claim) for claim in found], indent=1, ensure_ascii=False) + "\n"
     )
     (folder / "claims.md").write_text("\n".join(_claims_page(found, listed)) + "\n")
-    captions = {name: f"{_figure_number(name)}. {spec.title}" for name, spec in drawn.items()}
+    captions = {name: _caption(name, spec) for name, spec in drawn.items()}
     (folder / "index.md").write_text("\n".join(_index(results, paper, captions, listed, made)) + "\n")
+
+
+def _figures(results: Results, paper: Paper) -> dict[str, Curves]:
+    """The paper's figures of curves, then one for each study that the paper does not have."""
+    others = [study for study in results.studies if study not in {spec.study for spec in paper.figures.values()}]
+    return paper.figures | {
+        f"curves_{study}": paper.curves_of(study, results.env(study).get("kind", "")) for study in others
+    }
 
 
 def _tables(results: Results, paper: Paper) -> dict[str, Table]:
@@ -192,8 +200,9 @@ def _plain(claim: Claim) -> dict[str, object]:
     return claim._asdict() | {"ours": ours, "provisional": claim.provisional}
 
 
-def _figure_number(name: str) -> str:
-    return name.replace("fig_", "Fig. ")
+def _caption(name: str, spec: Curves) -> str:
+    """ "Fig. 7. Title" for the paper's figures, the title alone for others."""
+    return f"{name.replace('fig_', 'Fig. ')}. {spec.title}" if name.startswith("fig_") else spec.title
 
 
 def _replace(new: Path, old: Path) -> None:

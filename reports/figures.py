@@ -100,7 +100,7 @@ def learning_curves(results: Results, spec: Curves) -> Drawing | None:
         labels = (
             _draw_rulers(axes, rulers) + _draw_levels(axes, levels) + _draw_curves(axes, curves, results, spec.study)
         )
-        _finish(axes, curves, spec)
+        _finish(axes, curves, results.env(spec.study).get("kind", ""))
         _write_labels(axes, labels)
         _write_around(figure, axes, results, spec)
     return Drawing(figure, _numbers(curves, rulers, levels))
@@ -175,13 +175,13 @@ def _draw_curves(axes: Axes, curves: Mapping[str, pd.DataFrame], results: Result
     return labels
 
 
-def _finish(axes: Axes, curves: Mapping[str, pd.DataFrame], spec: Curves) -> None:
+def _finish(axes: Axes, curves: Mapping[str, pd.DataFrame], task: str) -> None:
     last = max(rows["step"].max() for rows in curves.values())
     axes.set_xlim(0, last or 1)
     axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: steps(x)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}".replace("-", "−")))
     axes.set_xlabel("environment steps")
-    per = "100 × mean reward per step" if spec.study != "navigation" else "sum over an episode"
+    per = "sum over an episode" if task == "navigation" else "100 × mean reward per step"
     axes.set_ylabel(f"return ({per})")
 
 

@@ -52,13 +52,19 @@ class Statement(Part):
 
 
 class Paper(Part):
-    """Everything the paper states that is compared."""
+    """Everything the paper states that is compared. `rulers`: scripted policies in the figures of other studies."""
 
     table_2: Ablation
     figures: dict[str, Curves]
     arms: dict[str, tuple[str, ...]]
     steps: dict[str, int]
     claims: dict[str, Statement]
+    rulers: dict[str, tuple[str, ...]]
+
+    def curves_of(self, study: str, task: str) -> Curves:
+        """Curves of a study that the paper does not have."""
+        title = f"{study.replace('_', ' ').capitalize()}: learning curves"
+        return Curves(study=study, title=title, place="", yardsticks=self.rulers.get(task, ()), levels={})
 
 
 def read(path: Path = FILE) -> Paper:

@@ -105,7 +105,9 @@ def test_a_failure_is_kept_and_tried_again(launch: Launch, shelf: list[MemoryRun
     recorder = launch()
     key = recorder.todo()[0].key
     recorder.failed(key, "ValueError: no", "Traceback ... ValueError: no")
-    assert recorder.failures == {"slow s0": "ValueError: no"}
+    assert [(name.split(" / ")[1], error) for name, error in recorder.failures.items()] == [
+        ("slow s0", "ValueError: no")
+    ]
     assert (shelf[0].status, shelf[0].tags["error"]) == ("failed", "ValueError: no")
     assert shelf[0].files["error.txt"].startswith(b"Traceback")
     assert launch().todo()[0].key == key
@@ -271,7 +273,7 @@ def test_run_skip_fail_and_retry(home: Path, cluster: None, capsys: pytest.Captu
 
     assert run_study(study, home) == 1
     said = capsys.readouterr()
-    assert "failed: slow s0: " in said.out
+    assert f"failed: {study.name} / slow s0: " in said.out
     assert str(blocked) in said.out
     assert "Traceback" not in said.out + said.err
     tracker = open_existing(study_card(study), Home(home))

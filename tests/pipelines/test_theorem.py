@@ -30,5 +30,5 @@ def test_a_file_is_no_folder(tmp_path: Path) -> None:
     file.touch()
     done = CliRunner().invoke(app, ["theorem", "--instances", "1", "--out", str(file)])
     assert isinstance(done.exception, InputError)
-    with pytest.raises(InputError, match="--out: .* is not a folder"):
+    with pytest.raises(InputError, match=r"--out: .* is not a folder"):
         raise done.exception

@@ -260,3 +260,12 @@ def test_an_unreadable_table_is_an_error_of_its_own(tmp_path: Path) -> None:
     with pytest.raises(TableError):
         build(tmp_path, tmp_path / "out", "quick")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_study_that_the_paper_does_not_have_gets_its_curves(runs: Path, tmp_path: Path) -> None:
+    for part in ("", ".runs"):
+        table = pd.read_parquet(runs / f"coverage{part}.parquet").assign(study="reach")
+        table.to_parquet(tmp_path / f"reach{part}.parquet")
+    build(tmp_path, tmp_path / "out", "quick")
+    assert (tmp_path / "out" / "figures" / "curves_reach.png").exists()
+    assert "![Reach: learning curves](figures/curves_reach.png)" in (tmp_path / "out" / "index.md").read_text()
