@@ -104,6 +104,9 @@ def _tables(results: Results, paper: Paper) -> dict[str, Table]:
     """Tables by file name; those with nothing to show are left out."""
     made = {"table_2": tables.table_2(results, paper)} if results.arms("ablation") else {}
     made |= {f"final_{study}": tables.finals(results, study) for study in results.studies}
+    made |= {
+        f"steadiness_{study}": t for study in results.studies if len((t := tables.steadiness(results, study)).shown)
+    }
     made |= {"yardsticks": tables.yardsticks(results)} if results.yardsticks else {}
     return made | {"runs": tables.runs(results)}
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from reports.frame import FINAL, Results
 from reports.paper import Paper
-from reports.stats import LEVEL, Interval, change, improvement, interval, iqm
+from reports.stats import LEVEL, Interval, change, curve, improvement, interval, iqm
 
 NONE = "–"  # where there is nothing to show
 
@@ -93,6 +93,39 @@ def finals(results: Results, study: str) -> Table:
             }
         )
     return Table(f"Final results of study {study}", pd.DataFrame(numbers), pd.DataFrame(shown))
+
+
+def steadiness(results: Results, study: str) -> Table:
+    """Whether arms keep what they have learned: the curve's mean at a quarter of the budget, its best and its last."""
+    numbers, shown = [], []
+    for arm in results.arms(study):
+        points = results.curve(study, arm)
+        if not len(points):
+            continue
+        rows = curve(points)
+        rows = rows[rows["n"] == rows["n"].max()]
+        quarter = rows[rows["step"] >= rows["step"].iloc[-1] / 4].iloc[0]
+        best, last = rows.loc[rows["mean"].idxmax()], rows.iloc[-1]
+        falls = [x["value"].max() - x["value"].iloc[-1] for _, x in points.groupby("seed")]
+        numbers.append(
+            {"study": study, "arm": arm, "quarter": quarter["mean"], "quarter_step": quarter["step"]}
+            | {"best": best["mean"], "best_step": best["step"], "last": last["mean"], "last_step": last["step"]}
+            | {"fall": best["mean"] - last["mean"], "largest_fall_of_a_seed": max(falls), "seeds": int(last["n"])}
+        )
+        shown.append(
+            {
+                "Arm": arm,
+                "At a quarter": f"{number(quarter['mean'])} ({steps(quarter['step'])})",
+                "Best": f"{number(best['mean'])} ({steps(best['step'])})",
+                "Last": f"{number(last['mean'])} ({steps(last['step'])})",
+                "Below the best": number(best["mean"] - last["mean"]),
+                "Worst seed": number(max(falls)),
+                "Seeds": str(int(last["n"])),
+            }
+        )
+    return Table(
+        f"Steadiness in study {study}: mean return along the budget", pd.DataFrame(numbers), pd.DataFrame(shown)
+    )
 
 
 def yardsticks(results: Results) -> Table:

@@ -59,7 +59,8 @@ def test_every_file_is_there(made: Path) -> None:
     names = ("table_2", "final_ablation", "final_coverage", "final_navigation", "yardsticks", "runs")
     assert {f"tables/{name}.{kind}" for name in names for kind in ("md", "csv", "tex")} < found
     assert {"claims.md", "claims.csv", "claims.json", "index.md"} < found
-    assert len(found) == 9 + 18 + 4
+    assert {f"tables/steadiness_{study}.md" for study in ("ablation", "coverage", "navigation")} < found
+    assert len(found) == 9 + 27 + 4
 
 
 def test_the_same_bytes_in_another_process_with_other_settings(runs: Path, made: Path, tmp_path: Path) -> None:
@@ -269,3 +270,17 @@ def test_a_study_that_the_paper_does_not_have_gets_its_curves(runs: Path, tmp_pa
     build(tmp_path, tmp_path / "out", "quick")
     assert (tmp_path / "out" / "figures" / "curves_reach.png").exists()
     assert "![Reach: learning curves](figures/curves_reach.png)" in (tmp_path / "out" / "index.md").read_text()
+
+
+def test_steadiness_is_best_and_last_of_the_mean_curve(runs: Path) -> None:
+    results = load(runs, "quick")
+    row = tables.steadiness(results, "coverage").numbers.iloc[0]
+    points = results.curve("coverage", row["arm"])
+    means = points.groupby("step")["value"].mean()
+    assert row["best"] == pytest.approx(means.max())
+    assert row["best_step"] == means.idxmax()
+    assert row["last"] == pytest.approx(means.iloc[-1])
+    assert row["fall"] == pytest.approx(means.max() - means.iloc[-1])
+    assert row["quarter_step"] == min(step for step in means.index if 4 * step >= means.index[-1])
+    falls = [seed["value"].max() - seed["value"].iloc[-1] for _, seed in points.groupby("seed")]
+    assert row["largest_fall_of_a_seed"] == pytest.approx(max(falls))
