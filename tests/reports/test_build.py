@@ -69,7 +69,7 @@ def test_the_same_bytes_in_another_process_with_other_settings(runs: Path, made:
     env = os.environ | {"PYTHONHASHSEED": "7", "MATPLOTLIBRC": str(tmp_path), "TZ": "Asia/Tokyo"}
     call = [sys.executable, "-m", "reports.build", "--runs", str(runs), "--out", str(out)]
     said = subprocess.run(call, cwd=ROOT, env=env, check=True, capture_output=True, text=True).stdout
-    assert said == f"31 files; start with {out / 'index.md'}\n"
+    assert said == f"40 files; start with {out / 'index.md'}\n"
     first, second = content(made), content(out)
     assert [name for name in first if first[name] != second.get(name)] == []
 
