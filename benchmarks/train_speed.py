@@ -1,5 +1,7 @@
 """Training steps per CPU second of every method at its default settings, one torch thread. Prints Markdown.
 
+`--study FILE` measures the arms of a study instead.
+
 A step is one environment step of one of the parallel copies; acting, storing and learning are timed, evaluation is not:
 point 0 of the training grid only evaluates, and its time is taken off the others'. `--profile` then shows where the
 time goes, by function of `rhmc` (cProfile) and by tensor operation (torch.profiler).
@@ -15,6 +17,7 @@ from env_speed import machine
 from torch.profiler import ProfilerActivity, profile
 
 import rhmc
+from pipelines.study import Setting, Study
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import EnvConfig, coverage, navigation
 from rhmc.trainer import Config, Trainer
@@ -36,6 +39,26 @@ def trainer(name: str, observation: str, encoder: str, kind: str, steps: int) ->
     algo = ALGORITHMS[kind][0].model_validate({"encoder": encoder})
     cfg = Config(steps=4 * steps, evaluations=4, eval_episodes=1, final_episodes=1)
     return Trainer(task(name, observation), algo, cfg, seed=0)
+
+
+def arm_trainer(setting: Setting, steps: int) -> Trainer:
+    """An arm of a study on the grid of `trainer`."""
+    cfg = setting.trainer.model_copy(
+        update={"steps": 4 * steps, "evaluations": 4, "eval_episodes": 1, "final_episodes": 1}
+    )
+    return Trainer(setting.env, setting.algo, cfg, seed=0)
+
+
+def study_table(file: Path, steps: int, profiled: bool) -> None:
+    """Print the rate of every arm, and where the first arm's time goes."""
+    arms = Study.load(file).arms
+    print("| arm | steps/s |\n|---|---:|")
+    for name, setting in arms.items():
+        print(f"| {name} | {rate(arm_trainer(setting, steps)):,.0f} |", flush=True)
+    if profiled:
+        run = arm_trainer(next(iter(arms.values())), steps // 4)
+        next(run), next(run)
+        print("", functions(run), operations(run), sep="\n\n", flush=True)
 
 
 def seconds(run: Trainer) -> float:
@@ -85,10 +108,14 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=16_000, help="environment steps that are timed")
     parser.add_argument("--algorithms", nargs="+", default=list(ALGORITHMS), choices=list(ALGORITHMS))
     parser.add_argument("--tasks", nargs="+", default=list(TASKS), choices=TASKS)
+    parser.add_argument("--study", type=Path, metavar="FILE", help="measure the arms of a study instead")
     parser.add_argument("--profile", action="store_true", help="show where the time goes, with both settings of each")
     args = parser.parse_args()
     cases = [(t, o, e, k) for t in args.tasks for k in args.algorithms for o, e in SETTINGS]
     print(f"{machine()} Training steps per CPU second, {args.steps:,} steps after as many for warm-up.\n")
+    if args.study:
+        study_table(args.study, args.steps, args.profile)
+        return
     print("| task | method | observation | encoder | steps/s |\n|---|---|---|---|---:|")
     for name, observation, encoder, kind in cases:
         speed = rate(trainer(name, observation, encoder, kind, args.steps))
