@@ -282,8 +282,12 @@ def fingerprint(file: Annotated[Path | None, typer.Argument(help="Write it there
     text = of_code() + "\n"
     if file is None:
         print(text, end="")
-    elif not file.exists() or file.read_text() != text:
-        file.write_text(text)
+        return
+    try:
+        if not file.exists() or file.read_text() != text:
+            file.write_text(text)
+    except OSError as error:
+        raise InputError(f"{file}: cannot be written ({error.strerror})") from error
 
 
 @app.command("report")
@@ -313,14 +317,16 @@ def ui(port: Annotated[int, typer.Option(min=1, max=65535, help="Where to listen
     home = Home(work_folder())
     if not uri and not home.database.exists():
         raise InputError(f"{home.database}: nothing is logged yet; `rhmc study run FILE` does it")
+    from pipelines.mlflow_tracker import charts
     from pipelines.mlflow_tracker import check as check_store
 
     try:
         check_store(uri or f"sqlite:///{home.database}")
+        curves = charts(uri or f"sqlite:///{home.database}", f"http://{HOST}:{port}")
     except StoreError as error:
         raise InputError(str(error)) from error
     _free(port)
-    _serve(uri or f"sqlite:///{home.database}", home.artifacts, port)
+    _serve(uri or f"sqlite:///{home.database}", home.artifacts, port, curves)
 
 
 def _free(port: int) -> None:
@@ -334,7 +340,7 @@ def _free(port: int) -> None:
             raise InputError(f"--port: {port} cannot be used ({error.strerror}); choose another") from error
 
 
-def _serve(uri: str, artifacts: Path, port: int) -> None:
+def _serve(uri: str, artifacts: Path, port: int, curves: Iterable[tuple[str, str]]) -> None:
     command = [
         sys.executable,
         "-m",
@@ -350,6 +356,8 @@ def _serve(uri: str, artifacts: Path, port: int) -> None:
     command += ["--workers", "1", "--artifacts-destination", str(artifacts)]
     quiet = {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false", "MLFLOW_DISABLE_TELEMETRY": "true", "DO_NOT_TRACK": "true"}
     _say(f"http://{HOST}:{port}/#/experiments?workflowType=machine_learning  (Ctrl-C ends it)")
+    for name, address in curves:
+        _say(f"  curves of {name}, to be grouped by the tag `variant`: {address}")
     server = subprocess.Popen(command, env=os.environ | quiet)
     try:
         code = server.wait()

@@ -91,6 +91,8 @@ class MlflowTracker:
     def _parent(self) -> str:
         runs = self._search("tags.role = 'study'")
         ref = runs[0].info.run_id if runs else self._create(self.study.study, {"role": PARENT}).info.run_id
+        assert self.experiment is not None
+        self.client.set_experiment_tag(self.experiment, "mlflow.note.content", self.study.note)
         self.client.set_tag(ref, "mlflow.note.content", self.study.note)
         self.client.update_run(ref, "RUNNING")
         return ref
@@ -179,7 +181,7 @@ class MlflowTracker:
         """The client's answer, read from MLflow's table `metrics` at once."""
         first: dict[tuple[str, int, str], float] = {}
         query = "SELECT run_uuid, step, key, value, is_nan FROM metrics WHERE run_uuid = ? ORDER BY timestamp"
-        with closing(sqlite3.connect(f"file:{sqlite_file(self.uri)}?mode=ro", uri=True)) as database:
+        with closing(sqlite3.connect(f"file:{sqlite_file(self.uri)}?mode=rw", uri=True)) as database:
             for ref in refs:
                 for run, step, metric, value, is_nan in database.execute(query, (ref,)):
                     first.setdefault((run, step, metric), float("nan") if is_nan else value)
@@ -196,6 +198,13 @@ class MlflowTracker:
     def name(self) -> str:
         """The experiment's name."""
         return experiment_name(self.study)
+
+    def file(self, ref: str, name: str, folder: Path) -> Path | None:
+        """See `Tracker`."""
+        with explained(self.uri):
+            if name not in {kept.path for kept in self.client.list_artifacts(ref)}:
+                return None
+            return Path(self.client.download_artifacts(ref, name, str(folder)))
 
     def where(self) -> str:
         """How to look at the experiment: a command, or a server's address."""
@@ -235,6 +244,16 @@ class MlflowRun:
         """See `RunLog`."""
         with explained(self.uri):
             self.client.set_terminated(self.ref, STATUS[status])
+
+
+def charts(uri: str, server: str) -> list[tuple[str, str]]:
+    """Each experiment with the address of its learning curves in the web interface, best final return first."""
+    view = (
+        "workflowType=machine_learning&compareRunsMode=CHART&orderByKey=metrics.%60final%2Freturn%60&orderByAsc=false"
+    )
+    with explained(uri):
+        found = MlflowClient(uri, uri).search_experiments(max_results=1000, order_by=["name ASC"])
+    return [(e.name, f"{server}/#/experiments/{e.experiment_id}/runs?{view}") for e in found if e.name != "Default"]
 
 
 def open_existing(study: StudyCard, home: Home) -> MlflowTracker | None:
@@ -284,14 +303,15 @@ def _check_file(path: Path) -> None:
             if not path.parent.is_dir():
                 raise StoreError(f"{path.parent}: no such folder (for the MLflow database)")
             return
-        with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as database:
+        if not os.access(path, os.W_OK):
+            raise StoreError(f"{path}: the MLflow database cannot be written to (read-only)")
+        # Not read-only: whoever was killed in the middle of a write left a journal, and SQLite now plays it back.
+        with closing(sqlite3.connect(f"file:{path}?mode=rw", uri=True)) as database:
             tables = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     except (sqlite3.Error, OSError) as error:
         raise StoreError(f"{path}: not an MLflow database ({error}); {advice}") from error
     if tables and not {"experiments", "runs", "metrics", "alembic_version"} <= tables:
         raise StoreError(f"{path}: a database, but not MLflow's; {advice}")
-    if not os.access(path, os.W_OK):
-        raise StoreError(f"{path}: the MLflow database cannot be written to (read-only)")
 
 
 def create_database(path: Path) -> None:
@@ -325,5 +345,5 @@ def explained(uri: str) -> Iterator[None]:
         yield
     except StoreError:
         raise
-    except (MlflowException, SQLAlchemyError, sqlite3.Error, OSError) as error:
+    except (MlflowException, SQLAlchemyError, sqlite3.Error, OSError, ImportError) as error:
         raise StoreError(f"{uri}: MLflow cannot go on: {one_line(error)}") from error

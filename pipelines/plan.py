@@ -57,10 +57,10 @@ def flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def what_varies(specs: Iterable[RunSpec]) -> list[str]:
-    """The dotted names whose value is not the same in all specs."""
+    """The dotted names whose value is not the same in all specs that have them."""
     flats = [flatten(spec.model_dump(mode="json")) for spec in specs]
     names = {name: None for flat in flats for name in flat}
-    return [name for name in names if len({json.dumps(flat.get(name)) for flat in flats}) > 1]
+    return [name for name in names if len({json.dumps(flat[name]) for flat in flats if name in flat}) > 1]
 
 
 def study_card(study: Study) -> StudyCard:
@@ -70,7 +70,7 @@ def study_card(study: Study) -> StudyCard:
     steps = sorted({run.spec.trainer.steps for run in study.runs()})
     budget = ", ".join(f"{count:,}" for count in steps)
     note = (
-        f"**{study.question}**\n\n"
+        f"{study.question}\n\n"
         f"Profile `{study.profile}`: {len(arms)} arms × {len(seeds)} seeds, {budget} environment steps each.\n\n"
         + "\n".join(f"- {arm}" for arm in arms)
         + "\n\nGroup the runs by the tag `variant` to compare arms."

@@ -3,6 +3,7 @@
 import logging
 import os
 import pickle
+import socket
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -17,6 +18,19 @@ from pipelines.recorder import Recorder
 from pipelines.store import StoreError, one_line
 from pipelines.trainable import RunTrainable
 
+KNOCK = 5.0  # seconds to wait for a cluster to answer
+
+
+def _knock(address: str | None) -> None:
+    """Raise `StoreError` if nobody listens at host:port: Ray itself would try for minutes."""
+    host, colon, port = (address or "").rpartition(":")
+    if not colon or not port.isdigit() or "://" in host:
+        return
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), KNOCK).close()
+    except OSError as error:
+        raise StoreError(f"Ray cannot be used, the cluster at RAY_ADDRESS={address}: {one_line(error)}") from error
+
 
 @contextmanager
 def ray_session(cpus: int) -> Iterator[None]:
@@ -29,6 +43,7 @@ def ray_session(cpus: int) -> Iterator[None]:
         yield
         return
     address = os.environ.get("RAY_ADDRESS")
+    _knock(address)
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.CRITICAL}
     # The paths of Ray's sockets may hold 107 characters, so they cannot lie in the work folder.
     with tempfile.TemporaryDirectory(prefix="ray", ignore_cleanup_errors=True) as sockets:

@@ -1,6 +1,8 @@
 """From results of training to the log and the board; knows neither Ray nor MLflow."""
 
 from collections import defaultdict
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from pipelines.plan import Item, finished, resolved_yaml
@@ -52,6 +54,9 @@ class Recorder:
             log = self.tracker.start(item.card)
             log.log(points)
             log.text("config.yaml", resolved_yaml(item, self.study))
+            with TemporaryDirectory() as folder:
+                if policy := self.tracker.file(source, "policy.pt", Path(folder)):
+                    log.artifact(policy)
             log.tag("reused_from", source)
             log.finish("finished")
             self.board.say(f"{item.name}: the same training was finished before; copied")
@@ -64,6 +69,7 @@ class Recorder:
         """A training begins or continues."""
         item = self.waiting[key][0]
         self.logs[key] = self.tracker.start(item.card)
+        self.logs[key].text("config.yaml", resolved_yaml(item, self.study))
         self.board.start(item.name, item.spec.trainer.steps)
 
     def result(self, key: str, result: dict[str, Any]) -> None:
@@ -79,7 +85,6 @@ class Recorder:
 
     def _finish(self, key: str) -> None:
         log, items, folder = self.logs[key], self.waiting.pop(key), self.home.checkpoints(key)
-        log.text("config.yaml", resolved_yaml(items[0], self.study))
         log.artifact(folder / "policy.pt")
         self._end(key, "finished")
         self.board.end(items[0].name, "finished")

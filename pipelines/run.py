@@ -1,6 +1,7 @@
 """Launch a study: what its plan still lacks goes through Ray Tune, results go to the log as they come."""
 
 import os
+import shlex
 import shutil
 import signal
 import sys
@@ -143,15 +144,20 @@ def _summary(study: Study, recorder: Recorder, tracker: "MlflowTracker") -> None
     print_table(console, ["arm", "finished", "mean return"], _arms(recorder.plan, tracker))
     for name, error in recorder.failures.items():
         console.print(f"failed: {name}: {error}", markup=False, highlight=False, soft_wrap=True)
-    next_command = f"rhmc export studies/{study.name}.yaml --profile {study.profile}"
-    if recorder.left:
-        next_command = f"rhmc study run studies/{study.name}.yaml --profile {study.profile}   (continues)"
+    next_command = f"rhmc {'study run' if recorder.left else 'export'} {_arguments(study)}"
+    next_command += "   (continues)" if recorder.left else ""
     lines = [
         f"look:  {tracker.where()}",
         f"       experiment {tracker.name!r} in {tracker.uri}",
         f"next:  {next_command}",
     ]
     console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+
+
+def _arguments(study: Study) -> str:
+    """What names this plan on the command line."""
+    changes = [word for text in study.overrides for word in ("--set", text)]
+    return shlex.join([study.file or f"studies/{study.name}.yaml", "--profile", study.profile, *changes])
 
 
 def _arms(plan: list[Item], tracker: Tracker) -> list[list[str]]:

@@ -91,6 +91,8 @@ class Study(Frozen):
     seeds: int
     steps: int
     resources: Resources
+    file: str = ""  # as given, for commands that a person can repeat
+    overrides: tuple[str, ...] = ()
 
     @classmethod
     def load(cls, path: Path | str, profile: str = "quick", overrides: Sequence[str] = ()) -> Self:
@@ -126,6 +128,7 @@ class Study(Frozen):
             raise StudyError(faults)
         resolved = {"seeds": getattr(file.seeds, profile), "steps": getattr(file.steps, profile)}
         fixed = {"question": file.question.strip(), "resources": file.resources, "profile": profile}
+        fixed |= {"file": str(path), "overrides": tuple(overrides)}
         return cls(name=path.stem, base=wanted.base, arms=wanted.arms, **fixed, **resolved)
 
     def runs(self) -> list[PlannedRun]:
@@ -212,6 +215,10 @@ def _patches(root: Node, overrides: Iterable[str]) -> tuple[list[Node], list[Fau
         key, equals, value = text.partition("=")
         parts = _target(root, key.strip())
         source = f"--set {text}"
+        arms = list(root.children.get("arms", root).children)
+        if parts[0] == "arms" and len(parts) > 2 and parts[1] not in arms:  # a whole arm may be added
+            faults.append(Fault(Place(source), "arms", f"no arm '{parts[1]}'; {choices(parts[1], arms)}"))
+            continue
         if not equals or not all(parts):
             faults.append(Fault(Place(source), "", "must be key=value, as in --set seeds=1 or --set algo.lr=1e-3"))
             continue

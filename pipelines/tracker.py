@@ -106,6 +106,10 @@ class Tracker(Protocol):
         """All values of the runs, each metric and step once, sorted."""
         ...
 
+    def file(self, ref: str, name: str, folder: Path) -> Path | None:
+        """Write a file that a run keeps to a folder; None if it keeps none of that name."""
+        ...
+
     def close(self, status: Status) -> None:
         """End the present launch. Runs left running become `interrupted`."""
         ...
@@ -203,6 +207,14 @@ class MemoryTracker:
     def rows(self, refs: Sequence[str]) -> list[Row]:
         """See `Tracker`."""
         return sorted(row for run in self.shelf if run.ref in refs for row in run.values)
+
+    def file(self, ref: str, name: str, folder: Path) -> Path | None:
+        """See `Tracker`."""
+        (run,) = [run for run in self.shelf if run.ref == ref]
+        if name not in run.files:
+            return None
+        (folder / name).write_bytes(run.files[name])
+        return folder / name
 
     def close(self, status: Status) -> None:
         """See `Tracker`."""

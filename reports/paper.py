@@ -63,8 +63,8 @@ class Paper(Part):
 
     def curves_of(self, study: str, task: str) -> Curves:
         """Curves of a study that the paper does not have."""
-        title = f"{study.replace('_', ' ').capitalize()}: learning curves"
-        return Curves(study=study, title=title, place="", yardsticks=self.rulers.get(task, ()), levels={})
+        rulers = self.rulers.get(task, ())
+        return Curves(study=study, title=f"Study {study}: learning curves", place="", yardsticks=rulers, levels={})
 
 
 def read(path: Path = FILE) -> Paper:

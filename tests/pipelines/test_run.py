@@ -2,6 +2,7 @@
 
 import io
 import os
+import socket
 import threading
 from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -16,11 +17,13 @@ from pipelines import progress
 from pipelines.export import export_study
 from pipelines.fingerprint import fingerprint
 from pipelines.mlflow_tracker import open_existing
-from pipelines.plan import Item, study_card
+from pipelines.plan import Item, study_card, what_varies
 from pipelines.progress import LiveBoard, PlainBoard, duration
+from pipelines.ray_driver import _knock
 from pipelines.recorder import Recorder
-from pipelines.run import run_study, show_status
+from pipelines.run import _arguments, run_study, show_status
 from pipelines.store import Home, StoreError
+from pipelines.study import Study
 from pipelines.tracker import MemoryRun, MemoryTracker, StudyCard, points_of
 from rhmc.algorithms import iql
 from rhmc.trainer import Trainer
@@ -30,6 +33,7 @@ STUDY = StudyCard("tiny", "quick", "")
 POINTS = [{"step": float(step), "eval/return": step / 100, "time/steps_per_second": 50.0} for step in (0, 200, 400)]
 
 Launch = Callable[..., Recorder]
+STUDIES = Path(__file__).parents[2] / "studies"
 
 
 @pytest.fixture
@@ -135,6 +139,7 @@ def test_what_another_study_finished_is_copied(launch: Launch, shelf: list[Memor
     assert [item.card.arm for item in recorder.todo()] == ["fast"]
     assert [(run.study.study, run.status) for run in shelf] == [("other", "finished"), ("tiny", "finished")]
     assert points_of(shelf[1].values) == POINTS
+    assert shelf[1].files["policy.pt"] == shelf[0].files["policy.pt"] == b"weights"
 
 
 def test_other_code_is_another_run(launch: Launch) -> None:
@@ -335,3 +340,25 @@ def test_a_log_that_fails_stops_the_study(
     tracker = open_existing(study_card(tiny()), Home(home))
     assert tracker is not None
     assert {run.status for run in tracker.recorded()} == {"interrupted"}
+
+
+def test_a_setting_that_one_method_lacks_does_not_vary_for_that() -> None:
+    specs = [run.spec for run in Study.load(STUDIES / "ablation.yaml").runs()]
+    varying = what_varies(specs)
+    assert {"algo.kind", "algo.regulator", "algo.filter", "seed"} <= set(varying)
+    assert "algo.alpha" not in varying
+
+
+def test_the_next_command_names_the_file_and_the_changes() -> None:
+    study = Study.load(STUDIES / "coverage.yaml", "quick", ["seeds=1", "algo.alpha=0.1"])
+    assert _arguments(study) == f"{STUDIES / 'coverage.yaml'} --profile quick --set seeds=1 --set algo.alpha=0.1"
+
+
+def test_a_cluster_that_is_not_there_is_one_line() -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    with pytest.raises(StoreError, match=f"RAY_ADDRESS={address}: .*refused"):
+        _knock(address)
+    _knock("auto")  # no place to knock at
+    _knock("ray://127.0.0.1:1")

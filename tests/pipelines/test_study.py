@@ -466,3 +466,8 @@ def test_a_method_that_cannot_act_in_its_task_is_named_where_the_task_says_so(tm
         Study.load(file)
     place = f"{file}:3:39: base.env.continuous"
     assert str(error.value) == f"{place}: 'rhmc' chooses among discrete actions; allowed: false"
+
+
+def test_an_override_adds_no_arm() -> None:
+    with pytest.raises(StudyError, match=r"no arm 'ful'; allowed: .*did you mean 'full'\?"):
+        load(GOOD, "quick", "arms.ful.algo.alpha=0.1")

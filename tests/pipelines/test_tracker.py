@@ -4,6 +4,8 @@ import math
 import shutil
 import socket
 import sqlite3
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -155,6 +157,12 @@ def test_how_a_run_looks_in_mlflow(home: Path) -> None:
     }
     assert run.data.tags.items() >= expected.items()
     assert parent.data.tags["mlflow.note.content"] == "**Why?**"
+    assert tracker.client.get_experiment(run.info.experiment_id).tags["mlflow.note.content"] == "**Why?**"
+    assert tracker.file(log.ref, "none.pt", home) is None
+    (home / "copy").mkdir()
+    kept = tracker.file(log.ref, "policy.pt", home / "copy")
+    assert kept is not None
+    assert kept.read_bytes() == (home / "policy.pt").read_bytes()
     assert parent.data.metrics == {}
     assert sorted(a.path for a in tracker.client.list_artifacts(log.ref)) == ["config.yaml", "policy.pt"]
     assert run.info.artifact_uri.startswith((home / "artifacts").as_uri())
@@ -302,3 +310,21 @@ def test_a_database_is_made_whole_or_not_at_all(tmp_path: Path, monkeypatch: pyt
 def test_the_template_is_not_written_to(template: Path, tmp_path: Path) -> None:
     shutil.copy(template, tmp_path / "mlflow.db")
     assert open_existing(STUDY, Home(tmp_path)).recorded() == []
+
+
+def test_a_database_whose_writer_was_killed_in_the_middle_of_a_write_is_used_again(home: Path) -> None:
+    MlflowTracker(STUDY, Home(home)).close("finished")
+    file = home / "mlflow.db"
+    write = (
+        "import os, sqlite3, sys\n"
+        "d = sqlite3.connect(sys.argv[1], isolation_level=None)\n"
+        "d.execute('PRAGMA cache_size = 1')\n"
+        "d.execute('BEGIN')\n"
+        "d.executemany('INSERT INTO experiment_tags VALUES (?, ?, 1)', [(f'k{i}', 'v' * 900) for i in range(2000)])\n"
+        "os._exit(9)\n"
+    )
+    subprocess.run([sys.executable, "-c", write, str(file)], check=False)
+    assert file.with_name("mlflow.db-journal").stat().st_size > 0
+    tracker = MlflowTracker(STUDY, Home(home))
+    assert len(tracker.client.get_experiment(tracker.experiment).tags) < 10
+    assert not file.with_name("mlflow.db-journal").exists()

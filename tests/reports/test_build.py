@@ -269,7 +269,7 @@ def test_a_study_that_the_paper_does_not_have_gets_its_curves(runs: Path, tmp_pa
         table.to_parquet(tmp_path / f"reach{part}.parquet")
     build(tmp_path, tmp_path / "out", "quick")
     assert (tmp_path / "out" / "figures" / "curves_reach.png").exists()
-    assert "![Reach: learning curves](figures/curves_reach.png)" in (tmp_path / "out" / "index.md").read_text()
+    assert "![Study reach: learning curves](figures/curves_reach.png)" in (tmp_path / "out" / "index.md").read_text()
 
 
 def test_steadiness_is_best_and_last_of_the_mean_curve(runs: Path) -> None:
