@@ -471,3 +471,10 @@ def test_a_method_that_cannot_act_in_its_task_is_named_where_the_task_says_so(tm
 def test_an_override_adds_no_arm() -> None:
     with pytest.raises(StudyError, match=r"no arm 'ful'; allowed: .*did you mean 'full'\?"):
         load(GOOD, "quick", "arms.ful.algo.alpha=0.1")
+
+
+def test_an_arm_of_the_wrong_shape_is_not_called_a_twin_as_well() -> None:
+    with pytest.raises(StudyError) as error:
+        load(GOOD.replace(ARMS, "arms:\n  a: {}\n  b: {horizon: 6}\n"))
+    assert "unknown key 'horizon'" in str(error.value)
+    assert "same as" not in str(error.value)
