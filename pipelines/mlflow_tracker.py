@@ -251,6 +251,9 @@ def charts(uri: str, server: str) -> list[tuple[str, str]]:
     view = (
         "workflowType=machine_learning&compareRunsMode=CHART&orderByKey=metrics.%60final%2Freturn%60&orderByAsc=false"
     )
+    quieten()
+    if uri.startswith("sqlite:") and sqlite_file(uri).stat().st_size == 0:
+        return []  # nothing yet, and asking would make the tables
     with explained(uri):
         found = MlflowClient(uri, uri).search_experiments(max_results=1000, order_by=["name ASC"])
     return [(e.name, f"{server}/#/experiments/{e.experiment_id}/runs?{view}") for e in found if e.name != "Default"]

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from pipelines import mlflow_tracker
-from pipelines.mlflow_tracker import MlflowTracker, open_existing
+from pipelines.mlflow_tracker import MlflowTracker, charts, open_existing
 from pipelines.store import Home, StoreError
 from pipelines.tracker import Card, MemoryRun, MemoryTracker, Row, StudyCard, Tracker, points_of
 
@@ -328,3 +328,14 @@ def test_a_database_whose_writer_was_killed_in_the_middle_of_a_write_is_used_aga
     tracker = MlflowTracker(STUDY, Home(home))
     assert len(tracker.client.get_experiment(tracker.experiment).tags) < 10
     assert not file.with_name("mlflow.db-journal").exists()
+
+
+def test_charts_are_addresses_of_the_experiments(home: Path) -> None:
+    tracker = MlflowTracker(STUDY, Home(home))
+    ((name, address),) = charts(tracker.uri, "http://127.0.0.1:5000")
+    assert name == "demo (quick)"
+    assert address.startswith(f"http://127.0.0.1:5000/#/experiments/{tracker.experiment}/runs?workflowType=")
+    empty = home / "empty.db"
+    empty.touch()
+    assert charts(f"sqlite:///{empty}", "") == []
+    assert empty.stat().st_size == 0
