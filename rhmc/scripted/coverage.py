@@ -63,15 +63,15 @@ def joint_one_step(cfg: Config, state: State, rng: Generator) -> Tensor:
 def set_point(cfg: Config, state: State, rng: Generator) -> Tensor:
     """Find the joint headings that would see the most targets, of all headings, and turn toward them.
 
-    Each sensor chooses a window or none (then it holds). Among equal unions the one with the fewest targets summed over
-    windows: no target is looked at twice without need.
+    Each sensor chooses a window or none (then it holds). Among equal unions one is drawn anew at every step.
     """
     bearing, distance = relation(state)
     member, turn = windows(bearing, distance <= RANGE)
     nothing = torch.zeros_like(member[:, :, :1])
     member = torch.cat((member, nothing), 2)
     turn = torch.cat((turn, torch.zeros_like(turn[..., :1])), -1)
-    return toward(_pick(turn, best_choice(member, member.sum(-1, dtype=torch.float32))))
+    lot = torch.rand(turn.shape, generator=rng, device=rng.device)
+    return toward(_pick(turn, best_choice(member, lot)))
 
 
 def planner(cfg: Config, state: State, rng: Generator) -> Tensor:
