@@ -36,7 +36,7 @@ def task(name: str, observation: str) -> EnvConfig:
 
 def trainer(name: str, observation: str, encoder: str, kind: str, steps: int) -> Trainer:
     """A method on a grid with `steps` environment steps between points, evaluated on a single episode."""
-    algo = ALGORITHMS[kind][0].model_validate({"encoder": encoder})
+    algo = ALGORITHMS[kind].config.model_validate({"encoder": encoder})
     cfg = Config(steps=4 * steps, evaluations=4, eval_episodes=1, final_episodes=1)
     return Trainer(task(name, observation), algo, cfg, seed=0)
 

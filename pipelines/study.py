@@ -23,7 +23,10 @@ from rhmc.types import Frozen
 
 PROFILES = ("quick", "paper")
 SECTIONS = ("env", "algo", "trainer")
-TABLES: dict[str, dict[str, tuple[type[Any], Any]]] = {"env": dict(ENVS), "algo": dict(ALGORITHMS)}
+TABLES: dict[str, dict[str, type[Any]]] = {  # the configuration of every kind
+    "env": {kind: entry[0] for kind, entry in ENVS.items()},
+    "algo": {kind: method.config for kind, method in ALGORITHMS.items()},
+}
 TWIN = "is the same as arm"
 COMMON = {"env": "observation", "algo": "encoder"}  # what must not differ between methods by oversight
 
@@ -47,7 +50,7 @@ class Setting(Frozen):
     @classmethod
     def _algo_of_kind(cls, value: Any) -> Any:
         """A plain mapping becomes the configuration that its kind names."""
-        return ALGORITHMS[value["kind"]][0].model_validate(value) if isinstance(value, dict) else value
+        return ALGORITHMS[value["kind"]].config.model_validate(value) if isinstance(value, dict) else value
 
     def canonical(self) -> str:
         """JSON with every default written out and keys sorted: equal exactly for equal settings."""
@@ -343,7 +346,7 @@ def _of_kind(section: str, node: Node) -> tuple[BaseModel | None, list[Fault]]:
         return None, []  # said of the base, or of the value
     if not isinstance(kind.value, str) or kind.value not in table:
         return None, [Fault(kind.place, kind.path, f"{show(kind.value)} is not allowed; {choices(kind.value, table)}")]
-    return validate(table[kind.value][0], node)
+    return validate(table[kind.value], node)
 
 
 def _trainer(node: Node, steps: Node | None) -> tuple[BaseModel | None, list[Fault]]:
@@ -399,8 +402,8 @@ def _unstated(base: Node | None, arm: Node) -> list[Fault]:
         common, kind, other = _child(before, field), _child(before, "kind"), _child(after, "kind")
         if not (common and kind and after and other) or kind.value == other.value or field in after.children:
             continue
-        entry = TABLES[section].get(str(other.value))
-        if entry and field in entry[0].model_fields:
+        config = TABLES[section].get(str(other.value))
+        if config and field in config.model_fields:
             text = f"missing; another kind inherits nothing, and the base has {show(common.value)}: state it here"
             faults.append(Fault(after.place, join(after.path, field), text))
     return faults

@@ -13,18 +13,15 @@ from torch import Generator, Tensor, nn
 from torch.nn.functional import mse_loss, softplus
 
 from rhmc.learner import Learner, unpack
-from rhmc.nets import ENCODERS, EncoderName, PairNet, Sizes, append
+from rhmc.nets import ENCODERS, PairNet, Sizes, append
 from rhmc.sampling import bernoulli, mix, relaxed_bernoulli
-from rhmc.types import Batch, Frozen, Obs, Spec, State
+from rhmc.settings import Slow
+from rhmc.types import Batch, Obs, Spec, State
 
 
-class Config(Frozen):
+class Config(Slow):
     """Settings of the high level; lr and gamma are the paper's."""
 
-    encoder: EncoderName = "mlp"
-    hidden: int = Field(64, ge=1)
-    lr: float = Field(5e-4, gt=0)
-    polyak: float = Field(0.995, ge=0, le=1, description="share of the slow copies kept per update")
     coordinator: Literal["ddpg", "counterfactual"] = "ddpg"
     entropy: float = Field(0.2, ge=0, description="weight of the assignment's entropy, for advantages of deviation 1")
     gamma_h: float = Field(0.99, ge=0, le=1, description="per assignment period")
@@ -41,8 +38,8 @@ class Coordinator:
         encoder = ENCODERS[cfg.encoder]
         actor = encoder.pairs(Sizes.of(spec), cfg.hidden, 1).to(rng.device)
         critic = encoder.pairs(Sizes.of(spec, pair=1), cfg.hidden, 1).to(rng.device)
-        self.actor = Learner(actor, lr=cfg.lr, polyak=cfg.polyak)
-        self.critic = Learner(critic, lr=cfg.lr, polyak=cfg.polyak)
+        self.actor = Learner(actor, lr=cfg.lr, polyak=cfg.polyak, clip=cfg.grad_clip)
+        self.critic = Learner(critic, lr=cfg.lr, polyak=cfg.polyak, clip=cfg.grad_clip)
 
     def assign(self, obs: Obs, rng: Generator, *, explore: bool) -> Tensor:
         """Assignment (B, N, M): drawn from the softened policy, or its threshold at 1/2."""

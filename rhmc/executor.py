@@ -5,6 +5,7 @@ agents' actions, and has one output per own action. The bootstrap keeps the assi
 executors' task does not change with the coordinator.
 """
 
+from functools import partial
 from typing import Literal
 
 import torch
@@ -14,18 +15,15 @@ from torch.nn.functional import mse_loss, one_hot
 
 from rhmc.filters import FILTERS
 from rhmc.learner import Learner, pack, unpack
-from rhmc.nets import ENCODERS, EncoderName, Sizes, append
+from rhmc.nets import ENCODERS, Sizes, append, team
 from rhmc.sampling import gumbel, mix
-from rhmc.types import Batch, Frozen, Obs, Spec, State, Transition, assigned_reward
+from rhmc.settings import Slow
+from rhmc.types import Batch, Obs, Spec, State, Transition, assigned_reward
 
 
-class Config(Frozen):
+class Config(Slow):
     """Settings of the low level; lr and gamma are the paper's."""
 
-    encoder: EncoderName = "mlp"
-    hidden: int = Field(64, ge=1)
-    lr: float = Field(5e-4, gt=0)
-    polyak: float = Field(0.995, ge=0, le=1, description="share of the slow copies kept per update")
     filter: Literal["on", "off"] = Field("on", description="hide unassigned targets from the executors (Eq. 10)")
     executor: Literal["gumbel", "expected"] = Field(
         "gumbel", description="actor's gradient: straight-through Gumbel-softmax, or the expectation over own actions"
@@ -44,10 +42,11 @@ class Executor:
         self.filter = FILTERS[cfg.filter]
         self.policy = {"gumbel": self._straight_through, "expected": lambda logits: logits.softmax(-1)}[cfg.executor]
         encoder, sizes = ENCODERS[cfg.encoder], Sizes.of(spec, pair=1)
-        actor = encoder.local(sizes, cfg.hidden, spec.actions).to(rng.device)
-        critic = encoder.central(sizes, cfg.hidden, spec.actions, joint=spec.actions).to(rng.device)
-        self.actor = Learner(actor, lr=cfg.lr, polyak=cfg.polyak)
-        self.critic = Learner(critic, lr=cfg.lr, polyak=cfg.polyak)
+        local = partial(encoder.local, sizes, cfg.hidden, spec.actions)
+        central = partial(encoder.central, sizes, cfg.hidden, spec.actions, joint=spec.actions)
+        actor, critic = (team(make, spec.agents, share=cfg.share).to(rng.device) for make in (local, central))
+        self.actor = Learner(actor, lr=cfg.lr, polyak=cfg.polyak, clip=cfg.grad_clip)
+        self.critic = Learner(critic, lr=cfg.lr, polyak=cfg.polyak, clip=cfg.grad_clip)
 
     def act(self, obs: Obs, assignment: Tensor, rng: Generator, *, explore: bool) -> Tensor:
         """Actions (B, N) int64: sampled from the softened policy, or its greatest logit."""

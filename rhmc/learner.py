@@ -59,7 +59,7 @@ class Learner(Generic[Net]):
     Args:
         net: what learns.
         lr: Adam's step size.
-        polyak: share of the slow copy kept per update (rho of Eq. 8 and 12).
+        polyak: share of the slow copy kept per update (rho of Eq. 8 and 12); 1 leaves it as it was.
         clip: largest norm of the gradient.
     """
 
@@ -77,8 +77,9 @@ class Learner(Generic[Net]):
             param.grad = grad
         norm = nn.utils.clip_grad_norm_(self.params, self.clip, foreach=True)
         self.optimiser.step()
-        with torch.no_grad():
-            torch._foreach_lerp_(self.slow_params, self.params, 1 - self.polyak)
+        if self.polyak < 1:
+            with torch.no_grad():
+                torch._foreach_lerp_(self.slow_params, self.params, 1 - self.polyak)
         return norm
 
     def state_dict(self) -> State:

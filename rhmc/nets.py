@@ -1,9 +1,9 @@
-"""Networks over an observation, in two encoders with the same three shapes.
+"""Networks over an observation, in two encoders with the same four shapes.
 
 `local`: each agent from its own row. `central`: each agent from everything, with joint actions. `pairs`: each (agent,
-target) pair from all pairs. The encoder `mlp` is the paper's fully connected layer on padded, flattened features with
-a one-hot agent id; `pairwise` shares one network over all (agent, target) pairs and pools, so that its weights act for
-any N and M.
+target) pair from all pairs. `mixer`: one value from each agent's, monotone in every one (QMIX). The encoder `mlp` is
+the paper's fully connected layer on padded, flattened features with a one-hot agent id; `pairwise` shares one network
+over all (agent, target) pairs and pools, so that its weights act for any N and M.
 """
 
 from collections.abc import Callable
@@ -12,6 +12,7 @@ from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import elu
 
 from rhmc.types import Obs, Spec
 
@@ -218,17 +219,78 @@ class PairwisePairs(PairNet):
         return self.head(hidden.relu_()).squeeze(-1)
 
 
+class FlatMixer(nn.Module):
+    """Values of the agents (B, N), mixed by weights made from all rows -> (B, 1). Rashid et al. 2018, figure 2."""
+
+    def __init__(self, sizes: Sizes, hidden: int, embed: int) -> None:
+        super().__init__()
+        state, self.embed = sizes.agents * _row(sizes), embed
+        self.first, self.bias = mlp(state, hidden, sizes.agents * embed), nn.Linear(state, embed)
+        self.second, self.value = mlp(state, hidden, embed), mlp(state, embed, 1)
+
+    def forward(self, obs: Obs, values: Tensor) -> Tensor:
+        state = _rows(obs).flatten(1)
+        first = self.first(state).unflatten(1, (-1, self.embed))
+        return mix(values, first, self.bias(state), self.second(state)) + self.value(state)
+
+
+class PairwiseMixer(nn.Module):
+    """The same with an agent's weights made from its own embedding, the rest from the mean over agents -> (B, 1)."""
+
+    def __init__(self, sizes: Sizes, hidden: int, embed: int) -> None:
+        super().__init__()
+        self.body = _AgentBody(sizes, hidden)
+        width = self.body.width
+        self.first, self.bias = mlp(width, hidden, embed), nn.Linear(width, embed)
+        self.second, self.value = mlp(width, hidden, embed), mlp(width, embed, 1)
+
+    def forward(self, obs: Obs, values: Tensor) -> Tensor:
+        each = self.body(obs)
+        state = each.mean(1)
+        return mix(values, self.first(each), self.bias(state), self.second(state)) + self.value(state)
+
+
+def mix(values: Tensor, first: Tensor, bias: Tensor, second: Tensor) -> Tensor:
+    """Two layers whose weights are taken without their sign, so that no value counts against the result.
+
+    Args:
+        values: (B, N). first: (B, N, E). bias, second: (B, E).
+
+    Returns:
+        (B, 1).
+    """
+    hidden = elu((values.unsqueeze(-1) * first.abs()).sum(1) + bias)
+    return (hidden * second.abs()).sum(-1, keepdim=True)
+
+
+class Unshared(nn.Module):
+    """A network of its own for every agent: row i of the output comes from the i-th. Each is run on all rows."""
+
+    def __init__(self, nets: list[nn.Module]) -> None:
+        super().__init__()
+        self.nets = nn.ModuleList(nets)
+
+    def forward(self, obs: Obs, *args: Tensor, **kwargs: Tensor) -> Tensor:
+        return torch.stack([net(obs, *args, **kwargs)[:, i] for i, net in enumerate(self.nets)], 1)
+
+
+def team(make: Callable[[], nn.Module], agents: int, *, share: bool) -> nn.Module:
+    """The network of all agents, or one for each of them. `make` builds a network with an output (B, N, ...)."""
+    return make() if share else Unshared([make() for _ in range(agents)])
+
+
 class Encoder(NamedTuple):
-    """The three shapes of one encoder."""
+    """The four shapes of one encoder."""
 
     local: Callable[..., nn.Module]
     central: Callable[..., nn.Module]
     pairs: Callable[..., PairNet]
+    mixer: Callable[..., nn.Module]
 
 
 ENCODERS: dict[str, Encoder] = {
-    "mlp": Encoder(FlatLocal, FlatCentral, FlatPairs),
-    "pairwise": Encoder(PairwiseLocal, PairwiseCentral, PairwisePairs),
+    "mlp": Encoder(FlatLocal, FlatCentral, FlatPairs, FlatMixer),
+    "pairwise": Encoder(PairwiseLocal, PairwiseCentral, PairwisePairs, PairwiseMixer),
 }
 
 

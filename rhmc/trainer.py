@@ -1,6 +1,6 @@
 """Training as an iterator of metrics on a fixed grid of steps; its state is a checkpoint."""
 
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import torch
 from pydantic import Field
@@ -16,7 +16,10 @@ class Config(Frozen):
     """Budget and evaluation of a run; all steps are environment steps, summed over the parallel copies."""
 
     steps: int = Field(5_000_000, ge=1)
-    num_envs: int = Field(64, ge=1, description="parallel copies; part of a run's identity, trajectories depend on it")
+    num_envs: int = Field(128, ge=1, description="parallel copies; part of a run's identity, trajectories depend on it")
+    time_limit: Literal["bootstrap", "terminal"] = Field(
+        "bootstrap", description="what the time limit is to every method: a cut that bootstraps, or an end"
+    )
     evaluations: int = Field(100, ge=1, description="points of the curve after the one at step 0")
     eval_episodes: int = Field(100, ge=1)
     final_episodes: int = Field(500, ge=1)
@@ -50,7 +53,7 @@ class Trainer:
             raise ValueError(fault)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(4 * seed + 3)
-            self.algorithm = ALGORITHMS[algo.kind][1](algo, self.env.spec, cfg.num_envs, learn_rng)
+            self.algorithm = ALGORITHMS[algo.kind].build(algo, self.env.spec, cfg.num_envs, learn_rng)
         self.obs = self.env.reset()
         self.carry = self.algorithm.carry(cfg.num_envs)
         self.step = 0
@@ -91,6 +94,7 @@ class Trainer:
         action, self.carry, extra = self.algorithm.act(obs, self.carry, self.act_rng, explore=True)
         options = self.env.options()
         step = self.env.step(action, extra.get("assignment"))
+        terminal = step.terminal | step.truncated if self.cfg.time_limit == "terminal" else step.terminal
         self.algorithm.observe(
             Transition(
                 obs,
@@ -98,7 +102,7 @@ class Trainer:
                 step.reward,
                 step.local,
                 step.completed,
-                step.terminal,
+                terminal,
                 step.truncated,
                 step.final_obs,
                 options,
@@ -151,7 +155,7 @@ class Means:
 
 def misfit(env: EnvConfig, algo: Any) -> str:
     """Why the method cannot act in the task, or nothing."""
-    if getattr(env, "continuous", False) and not ALGORITHMS[algo.kind][1].continuous:
+    if getattr(env, "continuous", False) and "continuous" not in ALGORITHMS[algo.kind].about.actions:
         return f"continuous: '{algo.kind}' chooses among discrete actions; allowed: false"
     return ""
 

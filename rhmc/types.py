@@ -11,6 +11,7 @@ from torch import Tensor
 
 Metrics = dict[str, float]
 Batch = dict[str, Tensor]
+Carry = Batch  # what an acting policy remembers between steps, tensors with leading B
 State = dict[str, Any]  # a checkpoint: only dicts, lists, tensors, numbers and strings
 
 

@@ -138,7 +138,7 @@ def test_means_and_the_standard_error() -> None:
 
 @pytest.mark.parametrize("kind", ALGORITHMS)
 def test_evaluating_leaves_the_run_and_the_global_generator_untouched_and_repeats_itself(kind: str) -> None:
-    config = ALGORITHMS[kind][0]
+    config = ALGORITHMS[kind].config
     small = {"hidden": 8, "buffer": 30, "batch": 8, "batch_h": 8, "warmup": 8, "steps_per_update": 4}
     algo = config(**{key: value for key, value in small.items() if key in config.model_fields})
     cfg = Config(steps=40, num_envs=4, evaluations=2, eval_episodes=2, final_episodes=2)

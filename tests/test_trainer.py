@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 from torch import Generator, Tensor
 
 from rhmc.algorithms import ALGORITHMS
+from rhmc.algorithms import rhmc as rhmc_page
+from rhmc.algorithms.base import Method
 from rhmc.envs import ENVS
 from rhmc.trainer import Config, Means, Trainer, grid_step
 from rhmc.types import Frozen, Metrics, Obs, Spec, Transition
@@ -61,7 +63,7 @@ class Recorder:
 @pytest.fixture(autouse=True)
 def _tables(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(ENVS, "toy", (toy.Config, toy))
-    monkeypatch.setitem(ALGORITHMS, "recorder", (RecorderConfig, Recorder))
+    monkeypatch.setitem(ALGORITHMS, "recorder", Method(RecorderConfig, Recorder, rhmc_page.ABOUT))
 
 
 def settle(**changes: Any) -> Config:
@@ -171,7 +173,7 @@ SMALL = {"hidden": 8, "buffer": 30, "batch": 8, "batch_h": 8, "warmup": 8, "step
 
 
 def method(kind: str) -> Any:
-    config = ALGORITHMS[kind][0]
+    config = ALGORITHMS[kind].config
     return config(**{key: value for key, value in SMALL.items() if key in config.model_fields})
 
 

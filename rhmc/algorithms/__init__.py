@@ -1,10 +1,11 @@
-"""The methods: kind -> (configuration, class). Everything that lists methods reads this table."""
+"""The methods: kind -> configuration, builder and description. Everything that lists methods reads this table."""
 
-from typing import Any
+from rhmc.algorithms import iql, qmix, rhmc, vdn
+from rhmc.algorithms.base import Method
 
-from rhmc.algorithms import iql, rhmc
-
-ALGORITHMS: dict[str, tuple[type[Any], type[Any]]] = {
-    "rhmc": (rhmc.Config, rhmc.RHMC),
-    "iql": (iql.Config, iql.IQL),
+ALGORITHMS: dict[str, Method] = {
+    "rhmc": Method(rhmc.Config, rhmc.RHMC, rhmc.ABOUT),
+    "qmix": Method(qmix.Config, qmix.build, qmix.ABOUT),
+    "vdn": Method(vdn.Config, vdn.build, vdn.ABOUT),
+    "iql": Method(iql.Config, iql.build, iql.ABOUT),
 }

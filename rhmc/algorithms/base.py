@@ -1,23 +1,39 @@
-"""What the trainer expects of an algorithm."""
+"""What the trainer expects of an algorithm, and what the table of algorithms says of each."""
 
-from typing import ClassVar, Protocol
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple, Protocol
 
 from torch import Generator, Tensor
 
-from rhmc.types import Batch, Obs, State, Transition
+from rhmc.types import Batch, Carry, Obs, State, Transition
 
-Carry = Batch  # what an acting policy remembers between steps, tensors with leading B
+
+class About(NamedTuple):
+    """A row of Table 1, beside what is counted from the built networks."""
+
+    name: str
+    source: str
+    family: Literal["value-based", "policy gradient", "actor-critic", "hierarchical"]
+    training: Literal["centralised", "decentralised"]
+    execution: Literal["decentralised", "central assignment, decentralised action"]
+    critic: str
+    coordination: str
+    actions: tuple[Literal["discrete", "continuous"], ...] = ("discrete",)
+
+
+class Method(NamedTuple):
+    """An entry of the table: `build(cfg, spec, num_envs, rng)` makes an `Algorithm`."""
+
+    config: type[Any]
+    build: Callable[..., "Algorithm"]
+    about: About
 
 
 class Algorithm(Protocol):
-    """A learner that acts. Built as `Algorithm(cfg, spec, num_envs, rng)`; `rng` samples while learning.
-
-    `continuous` tells whether it can act in a task of continuous actions (the trainer asks).
+    """A learner that acts. Built as `build(cfg, spec, num_envs, rng)`; `rng` samples while learning.
 
     Network weights are drawn from torch's global generator, which the trainer seeds around the construction.
     """
-
-    continuous: ClassVar[bool]
 
     def carry(self, batch: int) -> Carry:
         """Memory at the start of `batch` episodes."""

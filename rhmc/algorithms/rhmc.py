@@ -12,14 +12,26 @@ import torch
 from pydantic import Field
 from torch import Generator, Tensor
 
-from rhmc import coordinator, executor
-from rhmc.algorithms.base import Carry
+from rhmc import checkpoint, coordinator, executor
+from rhmc.algorithms.base import About
+from rhmc.experience import Experience
 from rhmc.learner import Replay, pack
 from rhmc.regulation import REGULATORS, executed
-from rhmc.types import Batch, Obs, Spec, State, Transition
+from rhmc.settings import OffPolicy
+from rhmc.types import Batch, Carry, Obs, Spec, State, Transition
+
+ABOUT = About(
+    name="RHMC",
+    source="the paper, Eq. 6 to 13",
+    family="hierarchical",
+    training="centralised",
+    execution="central assignment, decentralised action",
+    critic="central: of the assignment; of own actions given the others' actions and assignments",
+    coordination="assignment of targets, regulated reward, target-conditioned filter",
+)
 
 
-class Config(coordinator.Config, executor.Config):
+class Config(coordinator.Config, executor.Config, OffPolicy):
     """Settings; those that the text gives (lr, gammas, Algorithms 1 and 2 to the letter) are the defaults."""
 
     kind: Literal["rhmc"] = "rhmc"
@@ -27,25 +39,19 @@ class Config(coordinator.Config, executor.Config):
     horizon: int = Field(1, ge=1, description="steps that the regulator lets an agent act")
     alpha: float = Field(0.1, ge=0, le=1, description="alpha_1 of Eq. 6")
     assignment_period: int = Field(1, ge=1, description="steps for which an assignment is held")
-    buffer: int = Field(50_000, ge=1, description="rows kept at each level")
-    warmup: int = Field(2_000, ge=0, description="environment steps before the first update")
-    steps_per_update: int = Field(64, ge=1, description="environment steps collected for each update of the executors")
     coordinator_every: int = Field(1, ge=1, description="updates of the executors for each one of the coordinator")
 
 
 class RHMC:
     """See the module. Discrete actions only. Assignments are (B, N, M) float, 0 or 1."""
 
-    continuous = False
-
     def __init__(self, cfg: Config, spec: Spec, num_envs: int, rng: Generator) -> None:
         self.cfg, self.spec, self.rng = cfg, spec, rng
         self.regulate = REGULATORS[cfg.regulator]
         self.coordinator = coordinator.Coordinator(cfg, spec, rng)
         self.executor = executor.Executor(cfg, spec, rng)
-        self.low, self.high = Replay(cfg.buffer, rng), Replay(cfg.buffer, rng)
+        self.low, self.high = Experience(cfg, rng), Replay(cfg.buffer, rng)
         self.pending: Batch = {}  # the half-done assignment period of each environment
-        self.steps = self.updates = 0
 
     # Acting
 
@@ -58,8 +64,10 @@ class RHMC:
     def act(self, obs: Obs, carry: Carry, rng: Generator, *, explore: bool) -> tuple[Tensor, Carry, Batch]:
         """Assign where an episode or a period starts, then act on the filtered observation."""
         new = obs.first | (carry["age"] % self.cfg.assignment_period == 0)
-        drawn = self.coordinator.assign(obs, rng, explore=explore)
-        assignment = torch.where(new.view(-1, 1, 1), drawn, carry["assignment"])
+        assignment = carry["assignment"]
+        if bool(new.any()):
+            drawn = self.coordinator.assign(obs, rng, explore=explore)
+            assignment = torch.where(new.view(-1, 1, 1), drawn, assignment)
         action = self.executor.act(obs, assignment, rng, explore=explore)
         age = torch.where(new, 0, carry["age"]) + 1
         return action, {"assignment": assignment, "age": age}, {"assignment": assignment, "new": new}
@@ -69,8 +77,7 @@ class RHMC:
     def observe(self, transition: Transition) -> None:
         """Store the low-level rows of this step, and the high-level rows of the periods that end with it (Alg. 2)."""
         t, g, cfg = transition, transition.extra["assignment"], self.cfg
-        self.steps += len(t.reward)
-        self.low.add(self.executor.rows(t, g))
+        self.low.add(self.executor.rows(t, g), len(t.reward))
         none = torch.zeros_like(t.reward)
         start = pack(t.obs) | {"assignment": g, "earned": none, "length": none}
         start["bound"] = self.regulate(t.options(cfg.horizon), g, cfg.alpha)
@@ -93,38 +100,26 @@ class RHMC:
         Every `coordinator_every` of them, one of the coordinator.
         """
         logs: Batch = {}
-        due = (self.steps - self.cfg.warmup) // self.cfg.steps_per_update if self.high.size else 0
-        while self.updates < due:
-            logs |= self.executor.update(self.low.sample(self.cfg.batch))
-            if self.updates % self.cfg.coordinator_every == 0:
+        for rows in self.low.due() if self.high.size else ():
+            logs |= self.executor.update(rows)
+            if self.low.updates % self.cfg.coordinator_every == 0:
                 logs |= self.coordinator.update(self.high.sample(self.cfg.batch_h))
-            self.updates += 1
         return logs
 
     # Checkpoints
 
+    def _parts(self) -> dict[str, checkpoint.Part]:
+        levels: dict[str, checkpoint.Part] = {"coordinator": self.coordinator, "executor": self.executor}
+        return levels | {"low": self.low, "high": self.high}
+
     def state_dict(self) -> State:
-        """Both levels, replays, half-done periods, generator and counters."""
-        return {
-            "coordinator": self.coordinator.state_dict(),
-            "executor": self.executor.state_dict(),
-            "low_replay": self.low.state_dict(),
-            "high_replay": self.high.state_dict(),
-            "pending": self.pending,
-            "rng": self.rng.get_state(),
-            "steps": self.steps,
-            "updates": self.updates,
-        }
+        """Both levels, replays, half-done periods and generator."""
+        return checkpoint.save(self.rng, self._parts()) | {"pending": self.pending}
 
     def load_state_dict(self, state: State) -> None:
         """Continue from `state_dict`."""
-        self.coordinator.load_state_dict(state["coordinator"])
-        self.executor.load_state_dict(state["executor"])
-        self.low.load_state_dict(state["low_replay"])
-        self.high.load_state_dict(state["high_replay"])
+        checkpoint.load(state, self.rng, self._parts())
         self.pending = {key: value.to(self.rng.device) for key, value in state["pending"].items()}
-        self.rng.set_state(state["rng"].cpu())
-        self.steps, self.updates = state["steps"], state["updates"]
 
 
 def _where(mask: Tensor, new: Batch, old: Batch) -> Batch:

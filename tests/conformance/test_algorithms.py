@@ -42,7 +42,7 @@ class Case(NamedTuple):
 
 def settle(kind: str, **changes: Any) -> Any:
     """A small version of a method; settings that it does not have are left out."""
-    config = ALGORITHMS[kind][0]
+    config = ALGORITHMS[kind].config
     return config(**{k: v for k, v in SMALL.items() if k in config.model_fields} | changes)
 
 
@@ -261,7 +261,7 @@ def test_the_comparison_refuses_what_is_no_part_of_a_checkpoint() -> None:
 def build(algo: Any, env: Env, num_envs: int = 4) -> Any:
     with torch.random.fork_rng():
         torch.manual_seed(1)
-        return ALGORITHMS[algo.kind][1](algo, env.spec, num_envs, Generator().manual_seed(2))
+        return ALGORITHMS[algo.kind].build(algo, env.spec, num_envs, Generator().manual_seed(2))
 
 
 def world(cfg: Any, batch: int = 4, seed: int = 0) -> tuple[Env, Obs]:
@@ -504,7 +504,7 @@ LEARNING = {  # of the tiny task; the rest are a method's defaults
 @pytest.mark.parametrize("kind", ALGORITHMS)
 def test_every_method_learns_the_tiny_task(kind: str, encoder: str) -> None:
     """To 85 % of what two agents earn that go for a target each; acting at random earns about a third of it."""
-    config = ALGORITHMS[kind][0]
+    config = ALGORITHMS[kind].config
     known = {k: v for k, v in LEARNING.items() if k in config.model_fields}
     run = Trainer(
         toy.Config(),  # type: ignore[arg-type]

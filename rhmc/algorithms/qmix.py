@@ -1,0 +1,41 @@
+"""QMIX: the team's value is a monotone function of the agents' values, with weights made from the state.
+
+Source: Rashid et al. 2018, figure 2 and section 4; sizes and defaults after EPyMARL's benchmark (Papoudakis et al.
+2021) and the RHMC text, section 5.1.
+Departures: as in `iql` (feed-forward, replay of steps, double Q, slow target by polyak averaging, truncation
+bootstraps), Adam instead of RMSprop; the state is what all agents observe; with the pairwise encoder the weights on an
+agent's value come from its own embedding (`PairwiseMixer`), so that they fit any number of agents.
+"""
+
+from typing import Literal
+
+from pydantic import Field
+from torch import Generator
+
+from rhmc import qlearning
+from rhmc.algorithms.base import About
+from rhmc.nets import ENCODERS, Sizes
+from rhmc.types import Spec
+
+ABOUT = About(
+    name="QMIX",
+    source="Rashid et al. 2018",
+    family="value-based",
+    training="centralised",
+    execution="decentralised",
+    critic="none: a monotone mixture of the agents' action values, weighted by the state",
+    coordination="credit by a monotone value",
+)
+
+
+class Config(qlearning.Config):
+    """Settings; lr and gamma are the paper's, the mixer's size its source's."""
+
+    kind: Literal["qmix"] = "qmix"
+    embed: int = Field(32, ge=1, description="units of the mixer's hidden layer")
+
+
+def build(cfg: Config, spec: Spec, num_envs: int, rng: Generator) -> qlearning.QLearning:
+    """The learner."""
+    mixer = ENCODERS[cfg.encoder].mixer(Sizes.of(spec), cfg.hidden, cfg.embed)
+    return qlearning.QLearning(cfg, spec, rng, mixer)
