@@ -274,6 +274,29 @@ def theorem(
         raise InputError(str(error)) from error
 
 
+@app.command("methods")
+def methods(
+    out: Annotated[Path | None, typer.Option(help="Also write methods.json in this folder.")] = None,
+) -> None:
+    """Say what every method is (Table 1), with the parameters of the networks that it builds."""
+    from pipelines.methods import describe, export_methods
+    from pipelines.store import StoreError
+
+    found = describe()
+    rows = [
+        [m["name"], m["source"], m["family"], m["training"], m["execution"], ", ".join(m["actions"])]
+        + [f"{size['acting']:,} of {size['all']:,}" for size in m["parameters"]]
+        for m in found
+    ]
+    counted = [f"{size['task']['kind']}, {size['encoder']}" for size in found[0]["parameters"]]
+    _table(["method", "source", "family", "training", "execution", "actions", *counted], rows, numbers=counted)
+    try:
+        if out is not None:
+            print(f"wrote {export_methods(out)}", file=sys.stderr)
+    except StoreError as error:
+        raise InputError(str(error)) from error
+
+
 @app.command("fingerprint")
 def fingerprint(file: Annotated[Path | None, typer.Argument(help="Write it there, if it differs.")] = None) -> None:
     """Name the code that decides results: the same after editing a comment, another after editing behaviour."""

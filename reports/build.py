@@ -102,7 +102,8 @@ def _figures(results: Results, paper: Paper) -> dict[str, Curves]:
 
 def _tables(results: Results, paper: Paper) -> dict[str, Table]:
     """Tables by file name; those with nothing to show are left out."""
-    made = {"table_2": tables.table_2(results, paper)} if results.arms("ablation") else {}
+    made = {"table_1": tables.table_1(results)} if results.methods else {}
+    made |= {"table_2": tables.table_2(results, paper)} if results.arms("ablation") else {}
     made |= {f"final_{study}": tables.finals(results, study) for study in results.studies}
     made |= {
         f"steadiness_{study}": t for study in results.studies if len((t := tables.steadiness(results, study)).shown)
@@ -122,7 +123,8 @@ def _index(
 ) -> Iterator[str]:
     yield f"# Results, profile `{results.profile}`\n"
     yield f"{_summary(results)}\n"
-    gaps = results.gaps(paper.arms)
+    gaps = [] if results.methods else ["Table 1: no methods; `rhmc methods --out` writes them."]
+    gaps += results.gaps(paper.arms)
     if gaps:
         yield "Not everything is there yet: see [what is missing](#what-is-missing).\n"
     yield "## Learning curves\n"
@@ -137,6 +139,8 @@ def _index(
     for name, table in made.items():
         if name != "runs":
             yield f"## {table.title}\n"
+            if table.note:
+                yield f"{table.note}\n"
             yield f"{table.markdown()}\n"
             yield f"[CSV](tables/{name}.csv), [LaTeX](tables/{name}.tex)\n"
     yield "## Definitions\n"

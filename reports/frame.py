@@ -31,7 +31,9 @@ RUNS = (
     "question",
     "seconds",
 )
+METHOD = ("kind", "name", "source", "family", "training", "execution", "critic", "coordination")
 STATUSES = ("finished", "partial", "missing")
+METHODS = "methods.json"  # what the methods are
 YARDSTICKS, THEOREM = "yardsticks", "theorem"  # tables that are no studies
 FINAL, CURVE = "final/return", "eval/return"
 ERRORS = ("final/return_sem", "final/coverage_sem")  # of a scripted policy; one of both is there
@@ -67,11 +69,13 @@ class Results:
         points: columns `POINTS`.
         runs: columns `RUNS`; one row per planned run.
         profile: the profile that made them.
+        methods: one record per method: `METHOD` as texts, `actions`, and `parameters` per task and encoder.
     """
 
     points: pd.DataFrame
     runs: pd.DataFrame
     profile: str
+    methods: Sequence[Mapping[str, Any]] = ()
 
     @property
     def studies(self) -> list[str]:
@@ -209,8 +213,9 @@ def load(folder: Path, profile: str) -> Results:
             faults.append(f"{name}.parquet: {name}.runs.parquet (the planned runs) is not beside it")
         if name.endswith(".runs") and name.removesuffix(".runs") not in names:
             faults.append(f"{name}.parquet: {name.removesuffix('.runs')}.parquet (the points) is not beside it")
+    methods = _methods(folder / METHODS, faults)
     if not faults:
-        results = Results(_join(points, POINTS), _join(runs, RUNS), profile)
+        results = Results(_join(points, POINTS), _join(runs, RUNS), profile, methods)
         faults = [*_plan_faults(results), *_point_faults(results)]
         if not faults:
             return results
@@ -236,6 +241,35 @@ def _read(path: Path, columns: Sequence[str], faults: list[str]) -> pd.DataFrame
         if column in table and column in columns and len(table) and not pd.api.types.is_numeric_dtype(table[column]):
             faults.append(f"{path.name}: column {column!r} holds {table[column].dtype}, not numbers")
     return table.reindex(columns=list(columns))
+
+
+def _methods(path: Path, faults: list[str]) -> list[dict[str, Any]]:
+    """The records of the methods; none without the file."""
+    if not path.exists():
+        return []
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        return [
+            {name: str(row[name]) for name in METHOD}
+            | {"actions": [str(x) for x in row["actions"]]}
+            | {
+                "parameters": [
+                    {
+                        "task": dict(x["task"]),
+                        "encoder": str(x["encoder"]),
+                        "acting": int(x["acting"]),
+                        "all": int(x["all"]),
+                    }
+                    for x in row["parameters"]
+                ]
+            }
+            for row in found
+        ]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        faults.append(
+            f"{path.name}: not the methods as `rhmc methods --out` writes them ({type(error).__name__}: {error})"
+        )
+        return []
 
 
 def _join(tables: list[pd.DataFrame], columns: Sequence[str]) -> pd.DataFrame:

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from reports.frame import FINAL, Results
+from reports.frame import FINAL, METHOD, Results
 from reports.paper import Paper
 from reports.stats import LEVEL, Interval, change, curve, improvement, interval, iqm
 
@@ -20,6 +20,7 @@ class Table(NamedTuple):
     title: str
     numbers: pd.DataFrame
     shown: pd.DataFrame
+    note: str = ""  # what a reader has to know
 
     def markdown(self) -> str:
         """As a Markdown table."""
@@ -31,6 +32,35 @@ class Table(NamedTuple):
         plain = self.shown.map(lambda text: str(text).replace(NONE, "--"))
         body = plain.rename(columns=_escape).map(_escape)
         return body.to_latex(index=False, column_format="l" + "r" * (body.shape[1] - 1), caption=_escape(self.title))
+
+
+def table_1(results: Results) -> Table:
+    """What the methods are, in the order of the code's table; parameters of the networks that act and of all."""
+    numbers, shown, tasks = [], [], []
+    for method in results.methods:
+        row = {name: method[name] for name in METHOD} | {"actions": ", ".join(method["actions"])}
+        sizes: dict[str, list[str]] = {}
+        for size in method["parameters"]:
+            task = describe_task(size["task"])
+            tasks += [task] if task not in tasks else []
+            for part in ("acting", "all"):
+                row[f"{size['task']['kind']}_{size['encoder']}_{part}"] = size[part]
+            heading = f"Parameters, {size['task']['kind']} (all)"
+            sizes.setdefault(heading, []).append(f"{size['encoder']} {size['acting']:,} ({size['all']:,})")
+        numbers.append(row)
+        words = {name.capitalize(): method[name] for name in METHOD if name not in ("kind", "name")}
+        shown.append(
+            {"Method": method["name"]}
+            | words
+            | {"Actions": row["actions"]}
+            | {heading: "; ".join(counts) for heading, counts in sizes.items()}
+        )
+    note = (
+        "Generated from the code's table of algorithms. Parameters are counted in the networks that each method builds "
+        f"with its default settings for {joined(tasks)}: those that act, and in brackets all that learn; slow copies "
+        "are not counted."
+    )
+    return Table("Table 1: the methods", pd.DataFrame(numbers), pd.DataFrame(shown), note)
 
 
 def table_2(results: Results, paper: Paper) -> Table:

@@ -5,6 +5,7 @@ agents' actions, and has one output per own action. The bootstrap keeps the assi
 executors' task does not change with the coordinator.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import Literal
 
@@ -16,7 +17,7 @@ from torch.nn.functional import mse_loss, one_hot
 from rhmc.filters import FILTERS
 from rhmc.learner import Learner, pack, unpack
 from rhmc.nets import ENCODERS, Sizes, append, team
-from rhmc.sampling import gumbel, mix
+from rhmc.sampling import gumbel, mix, straight_through
 from rhmc.settings import Slow
 from rhmc.types import Batch, Obs, Spec, State, Transition, assigned_reward
 
@@ -28,6 +29,9 @@ class Config(Slow):
     executor: Literal["gumbel", "expected"] = Field(
         "gumbel", description="actor's gradient: straight-through Gumbel-softmax, or the expectation over own actions"
     )
+    low_reward: Literal["local", "team"] = Field(
+        "local", description="what the executors are paid: their scores on assigned targets, or the team's reward"
+    )
     gamma_l: float = Field(0.99, ge=0, le=1)
     epsilon: float = Field(0.05, ge=0, le=1, description="share of actions drawn at random while exploring")
     logit_penalty: float = Field(1e-3, ge=0, description="weight of the squared logits (as in MADDPG)")
@@ -38,9 +42,10 @@ class Executor:
     """All executors: one actor and one critic, shared parameters. Assignments are (B, N, M) float, 0 or 1."""
 
     def __init__(self, cfg: Config, spec: Spec, rng: Generator) -> None:
-        self.cfg, self.actions, self.rng = cfg, spec.actions, rng
-        self.filter = FILTERS[cfg.filter]
-        self.policy = {"gumbel": self._straight_through, "expected": lambda logits: logits.softmax(-1)}[cfg.executor]
+        self.cfg, self.actions = cfg, spec.actions
+        self.filter, self.paid = FILTERS[cfg.filter], PAID[cfg.low_reward]
+        policies = {"gumbel": partial(straight_through, rng=rng), "expected": partial(torch.softmax, dim=-1)}
+        self.policy: Callable[[Tensor], Tensor] = policies[cfg.executor]
         encoder, sizes = ENCODERS[cfg.encoder], Sizes.of(spec, pair=1)
         local = partial(encoder.local, sizes, cfg.hidden, spec.actions)
         central = partial(encoder.central, sizes, cfg.hidden, spec.actions, joint=spec.actions)
@@ -58,7 +63,7 @@ class Executor:
     def rows(self, t: Transition, assignment: Tensor) -> Batch:
         """One row per environment of Alg. 2's B_l."""
         rows = pack(t.obs) | pack(t.next_obs, "next_") | {"action": t.action, "terminal": t.terminal}
-        return rows | {"assignment": assignment, "reward": assigned_reward(t.local, assignment)}
+        return rows | {"assignment": assignment, "reward": self.paid(t, assignment)}
 
     def update(self, rows: Batch) -> Batch:
         """One step of the critic (Eq. 11) and one of the actor (Eq. 13, ascent)."""
@@ -80,10 +85,6 @@ class Executor:
         value = self.critic.slow(_told(after, g), joint=self._one_hot(best)).gather(-1, best.unsqueeze(-1)).squeeze(-1)
         return rows["reward"] + self.cfg.gamma_l * (~rows["terminal"]).unsqueeze(-1) * value
 
-    def _straight_through(self, logits: Tensor) -> Tensor:
-        soft = (logits + gumbel(logits.shape, self.rng)).softmax(-1)
-        return self._one_hot(soft.argmax(-1)) + (soft - soft.detach())
-
     def _seen(self, obs: Obs, assignment: Tensor) -> Obs:
         return _told(obs._replace(pairs=self.filter(obs.pairs, assignment)), assignment)
 
@@ -102,3 +103,14 @@ class Executor:
 
 def _told(obs: Obs, assignment: Tensor) -> Obs:
     return append(obs, pair=assignment.unsqueeze(-1))
+
+
+def _local(t: Transition, assignment: Tensor) -> Tensor:
+    return assigned_reward(t.local, assignment)
+
+
+def _team(t: Transition, assignment: Tensor) -> Tensor:
+    return t.reward.unsqueeze(-1).expand(assignment.shape[:2])
+
+
+PAID = {"local": _local, "team": _team}

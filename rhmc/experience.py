@@ -72,18 +72,25 @@ def flat(rows: Batch) -> Batch:
     return {key: value.flatten(0, 1) for key, value in rows.items()}
 
 
+def ends(rows: Batch) -> tuple[Tensor, Obs]:
+    """Where the true successor of a step is not the next row, (T, B) bool, and these successors, leading K.
+
+    That is where an episode ends and in the last row.
+    """
+    last = rows["ended"].clone()
+    last[-1] = True
+    after = {key: rows[key][last] for key in ("next_agents", "next_pairs", "next_peers")}
+    return last, unpack(after, "next_")
+
+
 def values(network: Callable[[Obs], Tensor], rows: Batch) -> tuple[Tensor, Tensor]:
     """Values (B, ...) of every step's observation and of its true successor: (T, B, ...) both.
 
     The successor of a step is the next row, but where an episode or the rollout ends: there, and only there, the
     network is asked about `next_` observations.
     """
-    length, batch = rows["reward"].shape
-    value = network(unpack(flat(rows))).unflatten(0, (length, batch))
-    last = rows["ended"].clone()
-    last[-1] = True
+    value = network(unpack(flat(rows))).unflatten(0, rows["reward"].shape)
+    last, after = ends(rows)
     following = torch.cat((value[1:], value[-1:]))
-    following[last] = network(
-        unpack({key: rows[key][last] for key in ("next_agents", "next_pairs", "next_peers")}, "next_")
-    )
+    following[last] = network(after)
     return value, following

@@ -107,3 +107,8 @@ def unpack(rows: Batch, prefix: str = "") -> Obs:
     pairs = rows[f"{prefix}pairs"]
     first = torch.zeros(len(pairs), dtype=torch.bool, device=pairs.device)
     return Obs(rows[f"{prefix}agents"], pairs, rows[f"{prefix}peers"], first)
+
+
+def choose(mask: Tensor, new: Batch, old: Batch) -> Batch:
+    """Rows of `new` where `mask` (B,), else of `old`."""
+    return {k: torch.where(mask.view(-1, *[1] * (v.dim() - 1)), v, old[k]) for k, v in new.items()}

@@ -58,6 +58,8 @@ class Standard:
         return (x - mean) / deviation
 
     def _see(self, x: Tensor) -> None:
+        if not x.numel():
+            return
         new = torch.stack((torch.ones_like(self.sums[0]), x.mean(), x.square().mean()))
         self.sums = torch.lerp(new, self.sums, KEPT)
 

@@ -201,6 +201,39 @@ def test_a_method_is_a_page(page: Path) -> None:
     assert len(page.read_text(encoding="utf-8").splitlines()) <= PAGE
 
 
+PAGES = sorted(p for p in (ROOT / "rhmc/algorithms").glob("*.py") if p.stem not in {"__init__", "base"})
+
+
+def unstated(page: str) -> list[str]:
+    """What the opening of a method's page does not say: where it is from, and where it departs from that."""
+    text = ast.get_docstring(ast.parse(page)) or ""
+    parts = {name: re.search(rf"^{name}\b[^:]*: *\S", text, re.MULTILINE) for name in ("Source", "Departures")}
+    return [name for name, found in parts.items() if not found]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_a_page_opens_with_its_source_and_its_departures(page: Path) -> None:
+    assert unstated(page.read_text(encoding="utf-8")) == []
+
+
+def test_a_page_that_does_not_is_found() -> None:
+    assert unstated('"""X.\n\nSource: Y 1999.\nDepartures, each a field: none.\n"""') == []
+    assert unstated('"""X. Source: Y.\n\nDepartures:\n"""') == ["Source", "Departures"]
+    assert unstated("x = 1") == ["Source", "Departures"]
+
+
+def test_every_method_has_a_row_in_the_list_of_departures() -> None:
+    lines = (ROOT / "docs/deviations.md").read_text(encoding="utf-8").partition("\n## The methods\n")[2].splitlines()
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
+    rows = {row[0]: row for row in cells[2:]}
+    abouts = {method.about.name: method.about for method in ALGORITHMS.values()}
+    assert unmatched("docs/deviations.md", abouts, rows) == []
+    assert {name: row[1] for name, row in rows.items()} == {name: about.source for name, about in abouts.items()}
+    for method in ALGORITHMS.values():
+        named = re.findall(r"`(\w+)`", rows[method.about.name][3])
+        assert unmatched(method.about.name, set(named) - set(method.config.model_fields), []) == []
+
+
 @pytest.fixture(scope="module")
 def stages() -> dict:
     return YAML(typ="safe").load((ROOT / "dvc.yaml").read_text(encoding="utf-8"))["stages"]
@@ -217,7 +250,7 @@ def test_the_report_depends_on_all_its_modules(stages: dict) -> None:
 
 
 def test_every_stage_that_computes_waits_for_the_fingerprint(stages: dict) -> None:
-    for stage in (stages["study"]["do"], stages["yardsticks"]):
+    for stage in (stages["study"]["do"], stages["yardsticks"], stages["theorem"], stages["methods"]):
         assert ".fingerprint" in stage["deps"]
     assert ".fingerprint" in stages["fingerprint"]["outs"][0]
 

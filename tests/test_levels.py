@@ -377,7 +377,7 @@ def test_high_rows_are_those_of_the_periods_worked_out_one_by_one(world: str, re
             periods[k]["earned"].append(oracle.reward(done, held[k].int().tolist(), alpha))
             if at == period - 1 or step % 7 == 6:
                 expected.append(periods[k] | {"next": t.next_obs.pairs[k]})
-    stored = algo.state_dict()["high_replay"]["rows"]
+    stored = algo.state_dict()["high"]["rows"]
     assert len(stored["reward"]) == len(expected) > 10
     for k, period_ in enumerate(expected):
         earned = sum(period_["earned"]) / len(period_["earned"])
@@ -404,7 +404,7 @@ def _bound(regulator: str, options: Tensor, held: Tensor, alpha: float) -> float
 def test_low_rows_are_every_step_under_the_assignment_held() -> None:
     algo, env = begin("navigation", 3, assignment_period=3)
     given = [played.given for played in play(algo, env, 9)]
-    stored = algo.state_dict()["low_replay"]["rows"]
+    stored = algo.state_dict()["low"]["replay"]["rows"]
     assert torch.equal(stored["action"], torch.cat([t.action for t in given]))
     assert torch.equal(stored["reward"], torch.cat([assigned_reward(t.local, t.extra["assignment"]) for t in given]))
     assert torch.equal(stored["next_pairs"], torch.cat([t.next_obs.pairs for t in given]))
@@ -423,7 +423,7 @@ def test_the_first_update_is_due_after_the_warm_up_and_then_at_the_set_rate() ->
     algo, env = begin("coverage", 4, warmup=10, steps_per_update=8)
     counts, before = [], 0
     for played in play(algo, env, 10):
-        counts.append(algo.state_dict()["updates"])
+        counts.append(algo.state_dict()["low"]["updates"])
         assert bool(played.logs) == (counts[-1] > before)
         before = counts[-1]
     assert counts == [max(0, (4 * k - 10) // 8) for k in range(1, 11)]

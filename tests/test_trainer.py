@@ -170,6 +170,7 @@ def test_exploring_while_training_and_greedy_while_evaluating() -> None:
 
 
 SMALL = {"hidden": 8, "buffer": 30, "batch": 8, "batch_h": 8, "warmup": 8, "steps_per_update": 4}
+SMALL |= {"rollout": 3, "epochs": 2, "minibatches": 2, "pretrain": 20, "assignment_period": 1}
 
 
 def method(kind: str) -> Any:

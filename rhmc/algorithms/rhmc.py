@@ -2,20 +2,21 @@
 
 Source: the RHMC paper, Eq. 6 to 13 and Algorithms 1 and 2; the levels are `rhmc.coordinator` and `rhmc.executor`.
 Departures, each a field of `Config`: `coordinator: counterfactual` and `executor: expected` beside the paper's
-gradients; `regulator: exact` beside Algorithm 1, with a `horizon`; an assignment may be held (`assignment_period`).
+gradients; `regulator: exact` beside Algorithm 1, with a `horizon`; an assignment may be held (`assignment_period`);
+both levels may learn from the team's reward (`high_reward`, `low_reward`).
 Eq. 7, 11 and 13 are read with standard signs; truncation bootstraps.
 """
 
-from typing import Literal
+from typing import Literal, Self
 
 import torch
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch import Generator, Tensor
 
 from rhmc import checkpoint, coordinator, executor
 from rhmc.algorithms.base import About
 from rhmc.experience import Experience
-from rhmc.learner import Replay, pack
+from rhmc.learner import Replay, choose, pack
 from rhmc.regulation import REGULATORS, executed
 from rhmc.settings import OffPolicy
 from rhmc.types import Batch, Carry, Obs, Spec, State, Transition
@@ -38,8 +39,17 @@ class Config(coordinator.Config, executor.Config, OffPolicy):
     regulator: Literal["none", "paper", "exact"] = "paper"
     horizon: int = Field(1, ge=1, description="steps that the regulator lets an agent act")
     alpha: float = Field(0.1, ge=0, le=1, description="alpha_1 of Eq. 6")
+    high_reward: Literal["assigned", "team"] = Field(
+        "assigned", description="what the coordinator is paid: Eq. 6, or the team's reward, which knows no regulation"
+    )
     assignment_period: int = Field(1, ge=1, description="steps for which an assignment is held")
     coordinator_every: int = Field(1, ge=1, description="updates of the executors for each one of the coordinator")
+
+    @model_validator(mode="after")
+    def _regulates(self) -> Self:
+        if self.high_reward == "team" and self.regulator != "none":
+            raise ValueError(f"regulator: '{self.regulator}' bounds Eq. 6; with high_reward 'team' allowed: 'none'")
+        return self
 
 
 class RHMC:
@@ -47,7 +57,7 @@ class RHMC:
 
     def __init__(self, cfg: Config, spec: Spec, num_envs: int, rng: Generator) -> None:
         self.cfg, self.spec, self.rng = cfg, spec, rng
-        self.regulate = REGULATORS[cfg.regulator]
+        self.regulate, self.paid = REGULATORS[cfg.regulator], PAID[cfg.high_reward]
         self.coordinator = coordinator.Coordinator(cfg, spec, rng)
         self.executor = executor.Executor(cfg, spec, rng)
         self.low, self.high = Experience(cfg, rng), Replay(cfg.buffer, rng)
@@ -78,11 +88,13 @@ class RHMC:
         """Store the low-level rows of this step, and the high-level rows of the periods that end with it (Alg. 2)."""
         t, g, cfg = transition, transition.extra["assignment"], self.cfg
         self.low.add(self.executor.rows(t, g), len(t.reward))
-        none = torch.zeros_like(t.reward)
-        start = pack(t.obs) | {"assignment": g, "earned": none, "length": none}
-        start["bound"] = self.regulate(t.options(cfg.horizon), g, cfg.alpha)
-        self.pending = p = _where(t.extra["new"], start, self.pending or start)
-        p["earned"] = p["earned"] + executed(t.completed, g, cfg.alpha)
+        if bool(t.extra["new"].any()):
+            none = torch.zeros_like(t.reward)
+            start = pack(t.obs) | {"assignment": g, "earned": none, "length": none}
+            start["bound"] = self.regulate(t.options(cfg.horizon), g, cfg.alpha)
+            self.pending = choose(t.extra["new"], start, self.pending or start)
+        p = self.pending = dict(self.pending)
+        p["earned"] = p["earned"] + self.paid(t, g, cfg.alpha)
         p["length"] = p["length"] + 1
         ended = t.terminal | t.truncated | (p["length"] >= cfg.assignment_period)
         self.high.add({key: value[ended] for key, value in self._period(t).items()})
@@ -122,5 +134,12 @@ class RHMC:
         self.pending = {key: value.to(self.rng.device) for key, value in state["pending"].items()}
 
 
-def _where(mask: Tensor, new: Batch, old: Batch) -> Batch:
-    return {k: torch.where(mask.view(-1, *[1] * (v.dim() - 1)), v, old[k]) for k, v in new.items()}
+def _assigned(t: Transition, assignment: Tensor, alpha: float) -> Tensor:
+    return executed(t.completed, assignment, alpha)
+
+
+def _team(t: Transition, assignment: Tensor, alpha: float) -> Tensor:
+    return t.reward
+
+
+PAID = {"assigned": _assigned, "team": _team}

@@ -1,6 +1,7 @@
 """What every method of the table must do, on both encoders and both tasks; and RHMC in its variants."""
 
 import io
+from functools import cache
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -13,24 +14,49 @@ from torch.overrides import TorchFunctionMode
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import ENVS, coverage, make_env, navigation
 from rhmc.envs.base import Env
+from rhmc.learner import Learner, Replay
+from rhmc.nets import Unshared
 from rhmc.trainer import Config, Trainer
-from rhmc.types import Obs, Transition
+from rhmc.types import Batch, Obs, Transition
 from tests import toy
 from tests.conformance import DifferentError, assert_same
 
 EPISODE = 7  # of both tasks here, so that runs of a few steps cross its end
-SMALL = {"hidden": 8, "buffer": 20, "batch": 8, "batch_h": 8, "warmup": 12, "steps_per_update": 4}
+SMALL = {
+    "hidden": 8,
+    "pretrain": 20,
+    "buffer": 20,
+    "batch": 8,
+    "batch_h": 8,
+    "warmup": 8,
+    "steps_per_update": 4,
+    "rollout": 3,
+    "epochs": 2,
+    "minibatches": 2,
+    "assignment_period": 1,
+}
 RUN = Config(steps=44, num_envs=4, evaluations=5, eval_episodes=2, final_episodes=2)  # ends at steps 12 20 28 36 44
 TASKS: dict[str, Any] = {
     "coverage": coverage.Config(agents=2, targets=3),
     "navigation": navigation.Config(agents=2, episode=EPISODE),
 }
-VARIANTS: dict[str, dict[str, Any]] = {  # of rhmc, beside its defaults
-    "none": {"regulator": "none", "filter": "off"},
-    "exact": {"regulator": "exact", "horizon": 2, "coordinator": "counterfactual", "executor": "expected"},
-    "period 3": {"assignment_period": 3},
-    "period 3 counterfactual": {"assignment_period": 3, "coordinator": "counterfactual", "regulator": "exact"},
+CONTINUOUS = navigation.Config(agents=2, episode=EPISODE, continuous=True)
+VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {  # beside the defaults, on both tasks
+    "rhmc none": ("rhmc", {"regulator": "none", "filter": "off"}),
+    "rhmc exact": (
+        "rhmc",
+        {"regulator": "exact", "horizon": 2, "coordinator": "counterfactual", "executor": "expected"},
+    ),
+    "rhmc period 3": ("rhmc", {"assignment_period": 3}),
+    "rhmc period 3 counterfactual": (
+        "rhmc",
+        {"assignment_period": 3, "coordinator": "counterfactual", "regulator": "exact"},
+    ),
+    "hitmac period 3": ("hitmac", {"assignment_period": 3, "rollout": 2}),
+    "mappo kl_adaptive": ("mappo", {"objective": "kl_adaptive"}),
+    "coma critic": ("coma", {"worth": "critic"}),
 }
+SCALES = ("none", "reward", "return")
 
 
 class Case(NamedTuple):
@@ -50,9 +76,22 @@ BASIC = {
     f"{kind}-{encoder}-{task}": Case(settle(kind, encoder=encoder), env)
     for kind, encoder, (task, env) in product(ALGORITHMS, ("mlp", "pairwise"), TASKS.items())
 }
-CASES = BASIC | {
-    f"rhmc {name}-{task}": Case(settle("rhmc", encoder="pairwise", **changes), env)
-    for (name, changes), (task, env) in product(VARIANTS.items(), TASKS.items())
+BASIC |= {
+    f"{kind}-{encoder}-continuous": Case(settle(kind, encoder=encoder), CONTINUOUS)
+    for kind, encoder in product(ALGORITHMS, ("mlp", "pairwise"))
+    if "continuous" in ALGORITHMS[kind].about.actions
+}
+UNSHARED = {f"{kind} unshared": Case(settle(kind, share=False), TASKS["navigation"]) for kind in ALGORITHMS}
+SCALED = {
+    f"{kind} {scale}": Case(settle(kind, standardise=scale), TASKS["navigation"])
+    for kind, scale in product(ALGORITHMS, SCALES)
+    if "standardise" in ALGORITHMS[kind].config.model_fields
+    and scale != ALGORITHMS[kind].config.model_fields["standardise"].default
+}
+CASES = BASIC | UNSHARED | SCALED
+CASES |= {
+    f"{name}-{task}": Case(settle(kind, encoder="pairwise", **changes), env)
+    for (name, (kind, changes)), (task, env) in product(VARIANTS.items(), TASKS.items())
 }
 basic = pytest.mark.parametrize("case", BASIC.values(), ids=BASIC)
 every = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
@@ -86,7 +125,9 @@ class Whole(NamedTuple):
     states: list[Any]
 
 
+@cache
 def whole(case: Case) -> Whole:
+    """Of seed 0. Hand its states on as copies: what is loaded may be changed in place."""
     run, metrics, states = trainer(case), [], []
     for item in run:
         metrics.append(item)
@@ -111,23 +152,32 @@ def test_a_run_continues_from_any_point_bit_for_bit(case: Case) -> None:
 def test_a_checkpoint_replaces_whatever_a_trainer_was_doing(case: Case) -> None:
     full, run = whole(case), trainer(case, seed=5)
     list(run)
-    run.load_state_dict(full.states[2])
+    run.load_state_dict(through_a_file(full.states[2]))
     assert list(run) == full.metrics[3:]
     assert_same(run.state_dict(), full.states[-1])
 
 
 @every
 def test_the_runs_that_are_resumed_go_through_what_they_should(case: Case) -> None:
-    """Episodes end, replays wrap around, networks are updated, periods of several steps are cut by the grid."""
+    """Episodes end, replays wrap around, networks are updated, periods and rollouts are cut by the grid."""
     full = whole(case)
-    names = [key for key in full.states[-1]["algorithm"] if "replay" in key]
-    assert names
-    for key in names:
-        replay = full.states[-1]["algorithm"][key]
-        assert 0 < replay["size"] <= 20
-    assert any(full.states[-1]["algorithm"][key]["size"] == 20 for key in names)
-    assert full.states[-1]["algorithm"]["updates"] == 8  # (44 - 12) / 4
-    assert not any("train/grad_norm" in m or "train/low_td" in m for m in full.metrics[:1])
+    algorithms = [state["algorithm"] for state in full.states]
+    replays, rollouts = (having(algorithms[-1], keys) for keys in ({"rows", "next", "size"}, {"rows"}))
+    assert replays or rollouts
+    if replays:  # a replay that is dropped after 5 steps of 4 environments is seen after 3, and all updates are due
+        most, updates = (12, 3) if "pretrain" in type(case.algo).model_fields else (20, 9)  # (20 or 44 - 8) / 4
+        assert max(r["size"] for state in algorithms for r in having(state, {"rows", "next", "size"})) == most
+        assert [paced["updates"] for paced in having(algorithms[-1], {"replay", "steps", "updates"})] == [updates]
+    if rollouts:
+        assert {len(rollout["rows"]) for state in algorithms for rollout in having(state, {"rows"})} == {0, 1, 2}
+    if decided := [kept["count"].tolist() for state in algorithms for kept in having(state, {"rows", "count"})]:
+        assert [] in decided
+        assert [1] * 4 in decided
+    nets = [having(state, {"net", "slow", "optimiser"}) for state in algorithms]
+    assert len(nets[0]) == len(learners(trainer(case).algorithm)) > 0
+    for before, after in zip(nets[0], nets[-1], strict=True):
+        assert not any(torch.equal(value, after["net"][key]) for key, value in before["net"].items() if value.dim() > 1)
+    assert not any(key.startswith("train/") for key in full.metrics[0])
     assert all(torch.isfinite(torch.tensor(list(m.values()))).all() for m in full.metrics)
     for before, after in zip(full.states, full.states[1:], strict=False):
         with pytest.raises(DifferentError):
@@ -135,8 +185,27 @@ def test_the_runs_that_are_resumed_go_through_what_they_should(case: Case) -> No
     if getattr(case.algo, "assignment_period", 1) == 3:
         ages = {int(age) for state in full.states[1:] for age in state["carry"]["age"]}
         assert {1, 2} & ages
-        lengths = {float(x) for state in full.states[1:] for x in state["algorithm"]["pending"]["length"]}
+        begun = [state["pending"] for state in algorithms[1:] if state["pending"]]
+        lengths = {float(x) for pending in begun for x in pending["length"]}
         assert {1.0, 2.0} & lengths
+
+
+def having(state: Any, keys: set[str]) -> list[Any]:
+    """Every dict inside a state that has these keys and no other."""
+    return [holder for holder in holders(state) if isinstance(holder, dict) and set(holder) == keys]
+
+
+def learners(thing: Any) -> list[Learner[Any]]:
+    """Every learner that hangs on a method."""
+    if isinstance(thing, Learner):
+        return [thing]
+    return [found for value in parts(thing).values() for found in learners(value)]
+
+
+def parts(thing: Any) -> dict[str, Any]:
+    """What hangs on an object of the project, its settings aside."""
+    ours = type(thing).__module__.startswith("rhmc") and hasattr(thing, "__dict__")
+    return {key: value for key, value in vars(thing).items() if key != "cfg"} if ours else {}
 
 
 def test_a_run_without_a_step_continues_too() -> None:
@@ -270,8 +339,16 @@ def world(cfg: Any, batch: int = 4, seed: int = 0) -> tuple[Env, Obs]:
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         for _ in range(3):  # away from the start: velocities, moves
-            obs = env.step(torch.randint(env.spec.actions, (batch, env.spec.agents))).obs
+            obs = env.step(at_random(env)).obs
     return env, obs._replace(first=torch.ones(batch, dtype=torch.bool))
+
+
+def at_random(env: Env) -> Tensor:
+    """A joint action."""
+    shape = (env.batch, env.spec.agents)
+    if env.spec.continuous:
+        return torch.rand(*shape, env.spec.actions) * 2 - 1
+    return torch.randint(env.spec.actions, shape)
 
 
 def seeded(seed: int = 3) -> Generator:
@@ -285,14 +362,25 @@ def test_actions_are_actions_and_nothing_given_is_changed(case: Case, explore: b
     algo = build(case.algo, env)
     carry = algo.carry(6)
     given = through_a_file({"obs": obs._asdict(), "carry": carry, "algo": algo.state_dict()})
-    action, after, extra = algo.act(obs, carry, seeded(), explore=explore)
-    assert action.shape == (6, env.spec.agents)
-    assert action.dtype == torch.int64
-    assert action.min() >= 0
-    assert action.max() < env.spec.actions
+    rng = seeded()
+    action, after, extra = algo.act(obs, carry, rng, explore=explore)
+    assert explore or torch.equal(rng.get_state(), seeded().get_state())  # greedy acting draws nothing
+    assert_actions(action, env, 6)
     assert_same(through_a_file({"obs": obs._asdict(), "carry": carry, "algo": algo.state_dict()}), given)
     assert {k: v.shape for k, v in after.items()} == {k: v.shape for k, v in carry.items()}
     assert all(len(v) == 6 and not v.requires_grad for v in (*after.values(), *extra.values()))
+
+
+def assert_actions(action: Tensor, env: Env, batch: int) -> None:
+    """Discrete: (B, N) int64 below the count; continuous: (B, N, A) in [-1, 1]."""
+    spec = env.spec
+    if spec.continuous:
+        assert (action.shape, action.dtype) == ((batch, spec.agents, spec.actions), torch.float32)
+        assert action.abs().max() <= 1
+    else:
+        assert (action.shape, action.dtype) == ((batch, spec.agents), torch.int64)
+        assert action.min() >= 0
+        assert action.max() < spec.actions
 
 
 @every
@@ -307,7 +395,12 @@ def test_greedy_acting_is_not_random_and_exploring_is_decided_by_the_generator(c
     assert torch.equal(act(0, True), act(0, True))
     assert not torch.equal(act(0, True), act(1, True))
     assert not torch.equal(act(0, True), act(0, False))
-    assert act(0, True).unique().tolist() == list(range(env.spec.actions))
+    drawn = act(0, True)
+    if env.spec.continuous:
+        assert (drawn.flatten(0, 1).amin(0) < 0).all()
+        assert (drawn.flatten(0, 1).amax(0) > 0).all()
+    else:
+        assert drawn.unique().tolist() == list(range(env.spec.actions))
 
 
 def reorder(obs: Obs, order: list[int]) -> Obs:
@@ -377,8 +470,15 @@ def _shift(state: Any, size: float = 0.1) -> None:
 # Learning targets
 
 
+LOSSES = (functional.mse_loss, functional.huber_loss, functional.smooth_l1_loss, functional.l1_loss)
+# Rows of one step, seen once and as they are: what a loss is handed is then known.
+PLAIN = {"warmup": 0, "steps_per_update": 1, "rollout": 1, "epochs": 1, "minibatches": 1, "standardise": "none"}
+PLAIN |= {"pretrain": 0, "assignment_period": 1}
+FLAG = torch.tensor([True])
+
+
 class Targets(TorchFunctionMode):
-    """Watches every squared error: whether its two sides carry a gradient, and the second side."""
+    """Watches every error that is learned from: whether its two sides carry a gradient, and the second side."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -386,11 +486,17 @@ class Targets(TorchFunctionMode):
         self.values: list[Tensor] = []
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        if func is functional.mse_loss:
+        if func in LOSSES:
             prediction, target = args[:2]
             self.sides.append((prediction.requires_grad, target.requires_grad))
             self.values.append(target.detach().clone())
         return func(*args, **(kwargs or {}))
+
+
+def plain(algo: Any, **changes: Any) -> Any:
+    """A method's settings with those of `PLAIN` and `changes` that it has."""
+    known = {key: value for key, value in (PLAIN | changes).items() if key in type(algo).model_fields}
+    return algo.model_copy(update=known)
 
 
 def transition(env: Env, obs: Obs, algo: Any, **changes: Any) -> Transition:
@@ -402,46 +508,89 @@ def transition(env: Env, obs: Obs, algo: Any, **changes: Any) -> Transition:
     return t._replace(**changes)
 
 
+PRETRAINED = [kind for kind in ALGORITHMS if "pretrain" in ALGORITHMS[kind].config.model_fields]
+
+
 def learn(case: Case, **changes: Any) -> tuple[Targets, Any]:
     """The targets of a first update on the rows of one step of one environment."""
     env, obs = world(case.env, batch=1)
-    algo = build(case.algo.model_copy(update={"warmup": 0, "steps_per_update": 1}), env, 1)
-    algo.observe(transition(env, obs, algo, **changes))
+    algo = build(case.algo, env, 1)
+    with torch.no_grad():
+        algo.observe(transition(env, obs, algo, **changes))
     with Targets() as watched:
         algo.update()
     assert watched.sides
     return watched, algo
 
 
-FLAG = torch.tensor([True])
-ONE_STEP = {name: case for name, case in CASES.items() if "period" not in name}
+ONE_STEP = {
+    name: Case(plain(case.algo), case.env)
+    for name, case in CASES.items()
+    if "period" not in name and case not in SCALED.values()
+} | {f"{kind} before the rest": Case(plain(settle(kind), pretrain=99), TASKS["coverage"]) for kind in PRETRAINED}
+one_step = pytest.mark.parametrize("case", ONE_STEP.values(), ids=ONE_STEP)
 
 
-@pytest.mark.parametrize("case", ONE_STEP.values(), ids=ONE_STEP)
+@one_step
 def test_targets_carry_no_gradient(case: Case) -> None:
     watched, algo = learn(case)
     assert set(watched.sides) == {(True, False)}
-    slow = [p for name, p in parameters(algo) if "slow" in name]
-    assert slow
-    assert all(p.grad is None and not p.requires_grad for p in slow)
+    assert all(p.grad is None and not p.requires_grad for p in slow_parameters(algo))
 
 
-def parameters(algo: Any, name: str = "") -> list[tuple[str, Tensor]]:
-    """Parameters of every network that hangs on a method, with the names that lead there."""
-    if isinstance(algo, torch.nn.Module):
-        return [(f"{name}.{key}", p) for key, p in algo.named_parameters()]
-    inner = vars(algo).items() if type(algo).__module__.startswith("rhmc") and hasattr(algo, "__dict__") else ()
-    return [found for key, value in inner if key != "cfg" for found in parameters(value, f"{name}.{key}")]
+def slow_parameters(algo: Any) -> list[Tensor]:
+    """Of the copies that targets come from; those of a learner that never follow are none."""
+    found = [p for learner in learners(algo) for p in learner.slow.parameters()]
+    assert found
+    return found
 
 
-@pytest.mark.parametrize("case", ONE_STEP.values(), ids=ONE_STEP)
+@one_step
+def test_no_loss_has_a_gradient_into_what_is_observed_afterwards(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever a loss is made of: its way to the next observation would go through a target."""
+    env, obs = world(case.env, batch=1)
+    algo = build(case.algo, env, 1)
+    with torch.no_grad():
+        algo.observe(transition(env, obs, algo))
+    rows: Batch = {}
+
+    def traced(take: Any) -> Any:
+        def taken(*args: Any) -> Any:
+            found = take(*args)
+            kept = {k: v.requires_grad_() if v.is_floating_point() else v for k, v in (found or {}).items()}
+            rows.update(kept)
+            return found and kept
+
+        return taken
+
+    update, into = Learner.update, []
+
+    def watch(self: Learner[Any], loss: Tensor) -> Tensor:
+        names = [key for key in rows if key.removeprefix("next_") in ("pairs", "agents", "peers") and rows[key].numel()]
+        grads = torch.autograd.grad(loss, [rows[key] for key in names], retain_graph=True, allow_unused=True)
+        into.append({key for key, grad in zip(names, grads, strict=True) if grad is not None})
+        return update(self, loss)
+
+    for kept, name in product(parts(algo).values(), ("sample", "take")):
+        if hasattr(kept, name):
+            monkeypatch.setattr(kept, name, traced(getattr(kept, name)))
+    monkeypatch.setattr(Replay, "sample", traced(Replay.sample))
+    monkeypatch.setattr(Learner, "update", watch)
+    algo.update()
+    assert into
+    assert {"pairs", "next_pairs"} <= set(rows)
+    assert not any(name.startswith("next_") for names in into for name in names)
+    assert case in ON_POLICY.values() or all("pairs" in names for names in into)
+
+
+@one_step
 def test_truncation_bootstraps_and_termination_does_not(case: Case) -> None:
     going, cut, over = (learn(case, **flags)[0].values for flags in ({}, {"truncated": FLAG}, {"terminal": FLAG}))
     assert all(torch.equal(a, b) for a, b in zip(going, cut, strict=True))
     assert not any(torch.equal(a, b) for a, b in zip(going, over, strict=True))
 
 
-@pytest.mark.parametrize("case", ONE_STEP.values(), ids=ONE_STEP)
+@one_step
 def test_a_terminal_row_is_worth_its_reward(case: Case) -> None:
     """So the targets of a last step do not depend on what is observed after it; others do."""
     _, obs = world(case.env, batch=1)
@@ -451,31 +600,32 @@ def test_a_terminal_row_is_worth_its_reward(case: Case) -> None:
         assert [torch.equal(a, b) for a, b in zip(here, there, strict=True)] == [equal] * len(here)
 
 
-def constant(net: Any, out: list[float]) -> None:
-    """Makes a network return `out` whatever it sees."""
-    weights = list(net.parameters())
-    with torch.no_grad():
-        for p in weights:
-            p.zero_()
-        weights[-1].copy_(torch.tensor(out).expand_as(weights[-1].view(-1, len(out))).reshape(-1))
+ON_POLICY = {
+    name: case
+    for name, case in ONE_STEP.items()
+    if "rollout" in type(case.algo).model_fields and getattr(case.algo, "pretrain", 0) == 0
+}
 
 
-@pytest.mark.parametrize("encoder", ["mlp", "pairwise"])
-@pytest.mark.parametrize("terminal", [False, True])
-def test_iql_target_by_hand(encoder: str, terminal: bool) -> None:
-    """Double Q: the network chooses action 2, the slow copy values it at 30."""
-    algo = settle("iql", encoder=encoder, warmup=0, steps_per_update=1, gamma=0.5)
-    env, obs = world(TASKS["coverage"], batch=1)
-    method = build(algo, env, 1)
-    constant(method.q.net, [0.0, 1.0, 2.0])
-    constant(method.q.slow, [50.0, 40.0, 30.0])
-    flags = {"terminal": torch.tensor([terminal]), "reward": torch.tensor([0.25]), "action": torch.tensor([[1, 0]])}
-    method.observe(transition(env, obs, method, **flags))
-    with Targets() as watched:
-        logs = method.update()
-    target = 0.25 if terminal else 0.25 + 0.5 * 30
-    assert torch.allclose(watched.values[0], torch.full((8, 2), target))
-    assert logs["td_loss"].item() == pytest.approx(((1 - target) ** 2 + target**2) / 2)
+@pytest.mark.parametrize("flag", ["terminal", "truncated", None])
+@pytest.mark.parametrize("case", ON_POLICY.values(), ids=ON_POLICY)
+def test_a_sequence_stops_where_an_episode_ends(case: Case, flag: str | None) -> None:
+    """What happens in the next episode is nothing to the step before; within an episode it is."""
+    env, obs = world(case.env, batch=1)
+    found = []
+    for shift in (0.0, 1.0):
+        algo = build(plain(case.algo, rollout=2), env, 1)
+        start = obs._replace(pairs=obs.pairs + shift)
+        with torch.no_grad():
+            first = transition(env, obs, algo, next_obs=obs, reward=torch.ones(1), **({flag: FLAG} if flag else {}))
+            algo.observe(first)
+            second = transition(env, start, algo, reward=torch.tensor([3 + shift]))
+            algo.observe(second._replace(next_obs=start))
+        with Targets() as watched:
+            algo.update()
+        found.append({tuple(row) for row in watched.values[0].view(2, -1).tolist()})
+    assert len(found[0]) == 2
+    assert len(found[0] & found[1]) == (0 if flag is None else 1)
 
 
 # Learning
@@ -497,21 +647,93 @@ LEARNING = {  # of the tiny task; the rest are a method's defaults
     "coordinator": "counterfactual",
     "regulator": "exact",
     "assignment_period": 1,
+    "rollout": 6,
+    "pretrain": 8000,
 }
+LEARNING_OF: dict[str, dict[str, Any]] = {  # what a method needs beside or instead of that
+    "maddpg": {"gamma": 0.6, "penalty": 1e-2, "batch": 128, "steps_per_update": 16},
+    "coma": {"gamma": 0.6, "entropy": 0.05, "hidden": 64, "lr": 3e-3, "minibatches": 8},
+    "hitmac": {"gamma": 0.5, "hidden": 64, "lr": 3e-3},
+}
+STEPS = {"coma": 18_000, "hitmac": 14_000}  # 12 000 else
+
+
+def returns(kind: str, **changes: Any) -> list[float]:
+    """A method's mean return in the tiny task before and after learning."""
+    config = ALGORITHMS[kind].config
+    wanted = LEARNING | LEARNING_OF.get(kind, {})
+    known = {k: v for k, v in wanted.items() if k in config.model_fields}
+    run = Trainer(
+        toy.Config(),  # type: ignore[arg-type]
+        config(**known | changes),
+        Config(steps=STEPS.get(kind, 12_000), num_envs=32, evaluations=1, eval_episodes=300, final_episodes=1),
+        seed=0,
+    )
+    return [item["eval/return"] for item in run]
+
+
+def assert_learned(found: list[float]) -> None:
+    """To 85 % of what two agents earn that go for a target each; acting at random earns about a third of it."""
+    first, last = found
+    assert first < 0.5 * toy.own_target()
+    assert last > 0.85 * toy.own_target()
 
 
 @pytest.mark.parametrize("encoder", ["mlp", "pairwise"])
 @pytest.mark.parametrize("kind", ALGORITHMS)
 def test_every_method_learns_the_tiny_task(kind: str, encoder: str) -> None:
-    """To 85 % of what two agents earn that go for a target each; acting at random earns about a third of it."""
-    config = ALGORITHMS[kind].config
-    known = {k: v for k, v in LEARNING.items() if k in config.model_fields}
-    run = Trainer(
-        toy.Config(),  # type: ignore[arg-type]
-        config(**known | {"encoder": encoder}),
-        Config(steps=12_000, num_envs=32, evaluations=1, eval_episodes=300, final_episodes=1),
-        seed=0,
-    )
-    first, last = (item["eval/return"] for item in run)
-    assert first < 0.5 * toy.own_target()
-    assert last > 0.85 * toy.own_target()
+    assert_learned(returns(kind, encoder=encoder))
+
+
+@pytest.mark.parametrize(("kind", "scale"), [name.split() for name in SCALED])
+def test_every_method_learns_with_every_standardisation(kind: str, scale: str) -> None:
+    assert_learned(returns(kind, encoder="pairwise", standardise=scale))
+
+
+@pytest.mark.parametrize("encoder", ["mlp", "pairwise"])
+@pytest.mark.parametrize("kind", ALGORITHMS)
+def test_unshared_agents_learn_apart_and_act_by_their_own_networks(kind: str, encoder: str) -> None:
+    run = trainer(Case(settle(kind, encoder=encoder, share=False), TASKS["navigation"]))
+    teams, fresh = (unshared(each.algorithm) for each in (run, trainer(Case(run.algorithm.cfg, run.env_cfg))))
+    list(run)
+    assert len(teams) == len(fresh) > 0
+    for team, start in zip(teams, fresh, strict=True):
+        assert len(team.nets) == 2
+        for one, other in ((team.nets[0], team.nets[1]), *zip(team.nets, start.nets, strict=True)):
+            assert not any(map(torch.equal, weights(one), weights(other)))
+    before = act_greedily(run)
+    with torch.no_grad():
+        for p in (p for team in teams for p in team.nets[1].parameters()):
+            p.add_(torch.randn(p.shape, generator=seeded()))
+    changed = act_greedily(run) != before
+    assert changed.any(0).tolist() == [False, True]
+
+
+def weights(net: torch.nn.Module) -> list[Tensor]:
+    return [p for p in net.parameters() if p.dim() > 1]
+
+
+def act_greedily(run: Trainer) -> Tensor:
+    """Actions (B, N) in 200 states."""
+    _, obs = world(run.env_cfg, batch=200)
+    return run.algorithm.act(obs, run.algorithm.carry(200), seeded(), explore=False)[0]
+
+
+def unshared(algo: Any) -> list[Unshared]:
+    """The networks of a method that every agent has for itself."""
+    nets = [module for learner in learners(algo) for module in learner.net.modules()]
+    return [module for module in nets if isinstance(module, Unshared)]
+
+
+@pytest.mark.parametrize("kind", ALGORITHMS)
+def test_a_time_limit_that_ends_is_terminal_to_every_method(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    final = []
+    for limit, over in (("bootstrap", False), ("terminal", True)):
+        run = Trainer(TASKS["navigation"], settle(kind), RUN.model_copy(update={"time_limit": limit}), seed=0)
+        met, observe = [], run.algorithm.observe
+        monkeypatch.setattr(run.algorithm, "observe", lambda t, met=met, observe=observe: (met.append(t), observe(t)))
+        list(run)
+        assert [bool(t.truncated.all()) for t in met] == [k % EPISODE == EPISODE - 1 for k in range(11)]
+        assert all(torch.equal(t.terminal, t.truncated & over) for t in met)
+        final.append(torch.cat([p.flatten() for learner in learners(run.algorithm) for p in learner.params]))
+    assert not torch.equal(*final)

@@ -319,12 +319,12 @@ def test_the_kept_policy_acts(tmp_path: Path) -> None:
     save_atomically(tmp_path / "policy.pt", without_replay(trainer.state_dict()))
     policy = torch.load(tmp_path / "policy.pt", weights_only=True)["algorithm"]
     assert isinstance(one.algo, iql.Config)
-    actor = iql.IQL(one.algo, trainer.env.spec, 8, torch.Generator())
+    actor = iql.build(one.algo, trainer.env.spec, 8, torch.Generator())
     actor.load_state_dict(policy)
     rng = torch.Generator()
     wanted = trainer.algorithm.act(trainer.obs, {}, rng, explore=False)[0]
     assert torch.equal(actor.act(trainer.obs, {}, rng, explore=False)[0], wanted)
-    assert actor.steps == 600
+    assert actor.experience.steps == 600
 
 
 @pytest.mark.ray

@@ -117,8 +117,8 @@ def test_the_policy_is_the_last_state_with_empty_replays(start: Start, tmp_path:
     policy = torch.load(tmp_path / "a" / "run0" / "policy.pt", weights_only=True)
     assert run.trainer is not None
     state = run.trainer.state_dict()
-    assert policy["algorithm"]["replay"] == {"rows": {}, "next": 0, "size": 0}
-    assert state["algorithm"]["replay"]["size"] == 400
+    assert policy["algorithm"]["experience"]["replay"] == {"rows": {}, "next": 0, "size": 0}
+    assert state["algorithm"]["experience"]["replay"]["size"] == 400
     assert same(policy["algorithm"]["q"], state["algorithm"]["q"])
     assert same(policy, without_replay(state))
 

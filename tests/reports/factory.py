@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from reports.frame import POINTS, RUNS
+from reports.frame import METHOD, METHODS, POINTS, RUNS
 
 COVERAGE = {"kind": "coverage", "preset": "flat", "agents": 4, "targets": 5, "observation": "extended"}
 NAVIGATION = {"kind": "navigation", "agents": 3, "reward": "paper"}
@@ -89,6 +89,22 @@ def theorem(lost: int = 40) -> Tables:
         for metric, value in (("instances", 1000.0), ("lost", float(lost * (n + 1))), ("max_gap", 1.1 if lost else 0.0))
     ]
     return pd.DataFrame(rows, columns=list(POINTS)), pd.DataFrame(columns=list(RUNS))
+
+
+def methods(folder: Path, names: Sequence[str] = ("RHMC", "IQL")) -> Path:
+    """What `rhmc methods --out` writes: sizes 1000 k + 10 for the k-th method, 5 more for each next encoder or task."""
+    records = []
+    for k, name in enumerate(names, 1):
+        texts = {key: f"{key} of {name}" for key in METHOD} | {"kind": name.lower(), "name": name}
+        places = [(env, encoder) for env in (COVERAGE, NAVIGATION) for encoder in ("mlp", "pairwise")]
+        sizes = [
+            {"task": env, "encoder": encoder, "acting": 1000 * k + 10 + 5 * n, "all": 3000 * k + n}
+            for n, (env, encoder) in enumerate(places)
+        ]
+        records.append(texts | {"actions": ["discrete", "continuous"][:k], "parameters": sizes})
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / METHODS).write_text(json.dumps(records))
+    return folder
 
 
 def write(folder: Path, *tables: Tables) -> Path:

@@ -18,7 +18,7 @@ from reports import figures, tables
 from reports.build import build, main
 from reports.frame import TableError, load
 from reports.paper import read
-from tests.reports.factory import NAVIGATION, SCRIPTED, noisy, study, theorem, write, yardsticks
+from tests.reports.factory import NAVIGATION, SCRIPTED, methods, noisy, study, theorem, write, yardsticks
 
 ROOT = Path(__file__).parents[2]
 
@@ -27,7 +27,7 @@ ROOT = Path(__file__).parents[2]
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ablation = {"full": [69.0, 70.0, 74.0], "no regulation": noisy(60), "no filter": noisy(64), "IQL": noisy(62)}
     return write(
-        tmp_path_factory.mktemp("tables"),
+        methods(tmp_path_factory.mktemp("tables")),
         study("ablation", ablation),
         study("coverage", {"RHMC": noisy(67.2), "IQL": noisy(63)}),
         study("navigation", {"RHMC": noisy(-25), "IQL": noisy(-30)}, env=NAVIGATION, start=-60),
@@ -56,11 +56,11 @@ def content(folder: Path) -> dict[str, bytes]:
 def test_every_file_is_there(made: Path) -> None:
     found = set(content(made))
     assert {f"figures/fig_{n}.{kind}" for n in (6, 7, 10) for kind in ("png", "pdf", "csv")} < found
-    names = ("table_2", "final_ablation", "final_coverage", "final_navigation", "yardsticks", "runs")
+    names = ("table_1", "table_2", "final_ablation", "final_coverage", "final_navigation", "yardsticks", "runs")
     assert {f"tables/{name}.{kind}" for name in names for kind in ("md", "csv", "tex")} < found
     assert {"claims.md", "claims.csv", "claims.json", "index.md"} < found
     assert {f"tables/steadiness_{study}.md" for study in ("ablation", "coverage", "navigation")} < found
-    assert len(found) == 9 + 27 + 4
+    assert len(found) == 9 + 30 + 4
 
 
 def test_the_same_bytes_in_another_process_with_other_settings(runs: Path, made: Path, tmp_path: Path) -> None:
@@ -69,14 +69,22 @@ def test_the_same_bytes_in_another_process_with_other_settings(runs: Path, made:
     env = os.environ | {"PYTHONHASHSEED": "7", "MATPLOTLIBRC": str(tmp_path), "TZ": "Asia/Tokyo"}
     call = [sys.executable, "-m", "reports.build", "--runs", str(runs), "--out", str(out)]
     said = subprocess.run(call, cwd=ROOT, env=env, check=True, capture_output=True, text=True).stdout
-    assert said == f"40 files; start with {out / 'index.md'}\n"
+    assert said == f"43 files; start with {out / 'index.md'}\n"
     first, second = content(made), content(out)
     assert [name for name in first if first[name] != second.get(name)] == []
 
 
 def test_index(made: Path) -> None:
     text = (made / "index.md").read_text()
-    parts = ["## Learning curves", "## The paper's claims", "## Table 2", "## Scripted", "## Definitions", "## What is"]
+    parts = [
+        "## Learning curves",
+        "## The paper's claims",
+        "## Table 1",
+        "## Table 2",
+        "## Scripted",
+        "## Definitions",
+        "## What is",
+    ]
     assert [text.index(part) for part in parts] == sorted(text.index(part) for part in parts)
     assert "no such arm yet: HiT-MAC, QMIX, COMA, MAPPO, MADDPG" in text
     assert "code fingerprint `0123456789ab`, commit `c0ffee`" in text
@@ -92,6 +100,39 @@ def test_claims_as_json(made: Path) -> None:
     assert found["C8"]["provisional"] is True
     assert found["C8"]["ours"]["full"]["value"] == pytest.approx(71.0)
     assert found["C13"]["ours"]["4 x 3 x 5: % lost"] == {"value": 4.0, "low": None, "high": None, "n": 1}
+
+
+def test_table_1(runs: Path, made: Path) -> None:
+    table = tables.table_1(load(runs, "quick"))
+    rows = table.numbers.set_index("name")
+    assert list(rows.index) == ["RHMC", "IQL"]
+    assert rows.loc["IQL", "actions"] == "discrete, continuous"
+    assert rows.loc["IQL", ["critic", "execution"]].tolist() == ["critic of IQL", "execution of IQL"]
+    counted = ["coverage_mlp_acting", "coverage_mlp_all", "navigation_pairwise_acting", "navigation_pairwise_all"]
+    assert rows.loc["RHMC", counted].tolist() == [1010, 3000, 1025, 3003]
+    shown = table.shown.set_index("Method")
+    assert shown.loc["IQL", "Parameters, coverage (all)"] == "mlp 2,010 (6,000); pairwise 2,015 (6,001)"
+    assert shown.loc["RHMC", "Parameters, navigation (all)"] == "mlp 1,020 (3,002); pairwise 1,025 (3,003)"
+    assert shown.loc["RHMC", ["Source", "Actions"]].tolist() == ["source of RHMC", "discrete"]
+    assert "coverage flat, 4 sensors x 5 targets and navigation, 3 agents" in table.note
+    text = (made / "index.md").read_text()
+    assert f"## Table 1: the methods\n\n{table.note}\n\n{table.markdown()}\n" in text
+
+
+def test_a_report_without_methods_says_so(few: Path, tmp_path: Path) -> None:
+    build(few, tmp_path, "quick")
+    text = (tmp_path / "index.md").read_text()
+    assert "- Table 1: no methods; `rhmc methods --out` writes them.\n" in text
+    assert "## Table 1" not in text
+    assert not (tmp_path / "tables" / "table_1.md").exists()
+
+
+@pytest.mark.parametrize("text", ["", "{", "[1]", '{"a": 1}', '[{"kind": "x"}]'])
+def test_faulty_methods_are_named(tmp_path: Path, text: str) -> None:
+    write(tmp_path, study("coverage", {"RHMC": noisy(67)}, points=4))
+    (tmp_path / "methods.json").write_text(text)
+    with pytest.raises(TableError, match=r"^methods\.json: not the methods as `rhmc methods --out` writes them"):
+        load(tmp_path, "quick")
 
 
 def test_table_2(runs: Path) -> None:

@@ -1,0 +1,194 @@
+"""COMA, counterfactual multi-agent policy gradients: an agent is paid for what its action adds to the team's value.
+
+A central critic gives the value of each own action beside what everybody sees and what the others do. An action's
+advantage is its value minus the mean of all own actions' values under the policy: the others' part cancels out.
+
+Source: Foerster et al. 2018, eq. 4 and algorithm 1.
+Departures: an action is held to be worth its lambda-return, as the critic alone tells actions apart too badly (`worth:
+critic` is the source's rule); returns bootstrap with the mean of an agent's own action values, not the sampled one's;
+where a rollout or an episode ends, the others' next actions are drawn from the policy; advantages and returns are
+standardised; an entropy bonus beside the floor of the chances, which is constant; minibatches; feed-forward networks;
+a slow critic by polyak averaging, which also gives the baseline; truncation bootstraps (`trainer.time_limit`).
+"""
+
+from collections.abc import Iterator
+from typing import Literal
+
+import torch
+from pydantic import Field
+from torch import Generator, Tensor
+from torch.nn.functional import mse_loss, one_hot
+
+from rhmc import checkpoint
+from rhmc.algorithms.base import About
+from rhmc.experience import Rollout, ends, flat
+from rhmc.learner import Learner, unpack
+from rhmc.nets import ENCODERS, Sizes, team
+from rhmc.returns import td_lambda
+from rhmc.sampling import mix
+from rhmc.settings import OnPolicy, Slow, Standardised
+from rhmc.standardise import Standard
+from rhmc.types import Batch, Carry, Obs, Spec, State, Transition
+
+ABOUT = About(
+    name="COMA",
+    source="Foerster et al. 2018",
+    family="actor-critic",
+    training="centralised",
+    execution="decentralised",
+    critic="central: an agent's action values given the others' actions",
+    coordination="credit by a counterfactual baseline",
+)
+
+
+class Config(Slow, Standardised, OnPolicy):
+    """Settings, found on navigation and coverage; the paper's lr is 5e-4, its gamma 0.99, the source's lambda 0.8."""
+
+    kind: Literal["coma"] = "coma"
+    lr: float = Field(1e-3, gt=0, description="Adam's step size")
+    polyak: float = Field(0.98, ge=0, le=1, description="share of the slow critic kept per update")
+    gamma: float = Field(0.95, ge=0, le=1)
+    standardise: Literal["none", "reward", "return"] = Field(
+        "return", description="learn from rewards, or predict returns, of mean 0 and deviation 1 (`rhmc.standardise`)"
+    )
+    rollout: int = Field(10, ge=1, description="steps of each environment between updates")
+    entropy: float = Field(0.03, ge=0, description="weight of the policy's entropy")
+    lam: float = Field(0.9, ge=0, le=1, description="lambda of the returns")
+    worth: Literal["critic", "return"] = Field(
+        "return", description="what an action is worth, above the baseline: the critic's value of it, or its return"
+    )
+    scale: bool = Field(True, description="give a rollout's advantages mean 0 and deviation 1")
+    epochs: int = Field(2, ge=1, description="how often the critic sees a rollout; the actor sees it once")
+    minibatches: int = Field(8, ge=1, description="the critic's updates of an epoch")
+    actor_minibatches: int = Field(4, ge=1, description="the actor's updates of a rollout")
+    epsilon: float = Field(0.02, ge=0, le=1, description="share of the uniform policy in the one that explores")
+
+
+class COMA:
+    """See the module. Discrete actions only."""
+
+    def __init__(self, cfg: Config, spec: Spec, num_envs: int, rng: Generator) -> None:
+        self.cfg, self.actions, self.rng = cfg, spec.actions, rng
+        sizes, encoder = Sizes.of(spec), ENCODERS[cfg.encoder]
+        actor = team(lambda: encoder.local(sizes, cfg.hidden, spec.actions), spec.agents, share=cfg.share)
+        critic = team(
+            lambda: encoder.central(sizes, cfg.hidden, spec.actions, joint=spec.actions), spec.agents, share=cfg.share
+        )
+        self.actor = Learner(actor.to(rng.device), lr=cfg.lr, polyak=1, clip=cfg.grad_clip)
+        self.critic = Learner(critic.to(rng.device), lr=cfg.lr, polyak=cfg.polyak, clip=cfg.grad_clip)
+        self.standard = Standard(cfg.standardise, rng.device)
+        self.rollout = Rollout(cfg.rollout, rng.device)
+
+    # Acting
+
+    def carry(self, batch: int) -> Carry:
+        """Nothing is remembered."""
+        return {}
+
+    def act(self, obs: Obs, carry: Carry, rng: Generator, *, explore: bool) -> tuple[Tensor, Carry, Batch]:
+        """The likeliest action (B, N); when exploring one drawn from the policy, and the chances (B, N, actions)."""
+        logits = self.actor.net(obs)
+        if not explore:
+            return logits.argmax(-1), carry, {}
+        chance = self._chance(logits).detach()
+        return draw(chance, rng), carry, {"chance": chance}
+
+    def _chance(self, logits: Tensor) -> Tensor:
+        return mix(logits.softmax(-1), 1 / self.actions, self.cfg.epsilon)
+
+    # Learning
+
+    def observe(self, transition: Transition) -> None:
+        """Keep the step until the rollout is whole."""
+        self.standard.see_rewards(transition.reward)
+        self.rollout.add(transition, chance=transition.extra["chance"])
+
+    def update(self) -> Batch:
+        """The critic's updates, then the actor's, once the rollout is whole."""
+        rollout = self.rollout.take()
+        if rollout is None:
+            return {}
+        target, advantage = self._judged(rollout)
+        self.standard.see_returns(target)
+        rows = flat(rollout | {"target": self.standard.target(target), "advantage": advantage})
+        logs: Batch = {}
+        for part in self._minibatches(rows, self.cfg.epochs, self.cfg.minibatches):
+            loss, logs = self._critic_loss(part)
+            logs["critic_norm"] = self.critic.update(loss)
+        for part in self._minibatches(rows, 1, self.cfg.actor_minibatches):
+            loss, more = self._actor_loss(part)
+            logs |= more | {"grad_norm": self.actor.update(loss)}
+        return logs
+
+    def _minibatches(self, rows: Batch, epochs: int, parts: int) -> Iterator[Batch]:
+        count = len(rows["reward"])
+        for _ in range(epochs):
+            order = torch.randperm(count, generator=self.rng, device=self.rng.device)
+            for part in order.chunk(parts):
+                yield {key: rows[key][part] for key in rows if not key.startswith("next_")}
+
+    @torch.no_grad()
+    def _judged(self, rollout: Batch) -> tuple[Tensor, Tensor]:
+        """The lambda-return of every agent and the advantage of its action by the slow critic, (T, B, N) both."""
+        rows, shape = flat(rollout), rollout["reward"].shape
+        q = self._values(unpack(rows), rows["action"])
+        value = expected(q, rows["chance"]).unflatten(0, shape)
+        last, after = ends(rollout)
+        chance = self._chance(self.actor.net(after))
+        following = torch.cat((value[1:], value[-1:]))
+        following[last] = expected(self._values(after, draw(chance, self.rng)), chance)
+        reward = self.standard.reward(rollout["reward"])
+        reward, terminal, ended = (x.unsqueeze(-1) for x in (reward, rollout["terminal"], rollout["ended"]))
+        target = td_lambda(reward, following, terminal, ended, self.cfg.gamma, self.cfg.lam)
+        worth = {"critic": taken(q, rows["action"]).unflatten(0, shape), "return": target}[self.cfg.worth]
+        advantage = worth - value
+        if self.cfg.scale:
+            advantage = (advantage - advantage.mean()) / advantage.std(correction=0).clamp(min=1e-6)
+        return target, advantage
+
+    def _values(self, obs: Obs, action: Tensor) -> Tensor:
+        """What the slow critic says of every own action beside the others': (B, N, actions)."""
+        return self.standard.value(self.critic.slow(obs, joint=self._joint(action)))
+
+    def _joint(self, action: Tensor) -> Tensor:
+        return one_hot(action, self.actions).float()
+
+    def _critic_loss(self, rows: Batch) -> tuple[Tensor, Batch]:
+        q = taken(self.critic.net(unpack(rows), joint=self._joint(rows["action"])), rows["action"])
+        loss = mse_loss(q, rows["target"])
+        return loss, {"critic_loss": loss, "q": q.mean()}
+
+    def _actor_loss(self, rows: Batch) -> tuple[Tensor, Batch]:
+        chance = self._chance(self.actor.net(unpack(rows)))
+        surprise = -chance.clamp(min=1e-10).log()
+        entropy = (chance * surprise).sum(-1).mean()
+        gain = (rows["advantage"] * -taken(surprise, rows["action"])).mean()
+        return -gain - self.cfg.entropy * entropy, {"entropy": entropy, "gain": gain}
+
+    # Checkpoints
+
+    def _parts(self) -> dict[str, checkpoint.Part]:
+        return {"actor": self.actor, "critic": self.critic, "rollout": self.rollout, "standard": self.standard}
+
+    def state_dict(self) -> State:
+        """Networks, rollout, statistics and generator."""
+        return checkpoint.save(self.rng, self._parts())
+
+    def load_state_dict(self, state: State) -> None:
+        """Continue from `state_dict`."""
+        checkpoint.load(state, self.rng, self._parts())
+
+
+def draw(chance: Tensor, rng: Generator) -> Tensor:
+    """Actions (B, N) from their chances (B, N, actions)."""
+    return torch.multinomial(chance.flatten(0, 1), 1, generator=rng).view(chance.shape[:2])
+
+
+def taken(values: Tensor, action: Tensor) -> Tensor:
+    """The values (B, N, actions) of the actions taken (B, N)."""
+    return values.gather(-1, action.unsqueeze(-1)).squeeze(-1)
+
+
+def expected(q: Tensor, chance: Tensor) -> Tensor:
+    """The mean (B, N) of action values under their chances, (B, N, actions) both: the baseline of eq. 4."""
+    return (q * chance).sum(-1)

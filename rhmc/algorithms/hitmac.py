@@ -1,0 +1,177 @@
+"""HiT-MAC: executors learn alone under any assignment and are frozen; then a coordinator learns to assign them.
+
+Source: Xu et al. 2020, section 3: executors paid by the targets assigned to them; a coordinator with attention over all
+pairs, whose critic adds up the pairs' approximate marginal contributions, holds an assignment for 10 steps and learns
+from the team's reward.
+Departures: the executors are those of `rhmc.executor` (off-policy, a central critic) instead of A3C, under assignments
+drawn at random (`practice`), within the run's budget (`pretrain`). Synchronous instead of A3C: rollouts of all
+environments, several epochs on each with every pair's ratio of probabilities clipped (`epochs: 1, minibatches: 1` is
+the plain actor-critic), normalised advantages, predicted returns standardised. A period that an episode cuts short
+counts for the steps it had. A pair's contribution is judged from the mean of those before it, not by attention over
+them; its order is drawn, not fixed. Truncation bootstraps.
+"""
+
+from typing import Literal
+
+import torch
+from pydantic import Field
+from torch import Generator, Tensor
+
+from rhmc import attention, checkpoint, executor
+from rhmc.algorithms.base import About
+from rhmc.experience import Experience
+from rhmc.learner import Replay, choose, pack
+from rhmc.settings import OffPolicy
+from rhmc.types import Batch, Carry, Obs, Spec, State, Transition
+
+ABOUT = About(
+    name="HiT-MAC",
+    source="Xu et al. 2020",
+    family="hierarchical",
+    training="centralised",
+    execution="central assignment, decentralised action",
+    critic="central: of the state, a sum of the pairs' marginal contributions; of own actions for the executors",
+    coordination="assignment of targets to executors trained before",
+)
+PRACTISED = 10  # steps that a random assignment lasts on average
+
+
+class Config(attention.Config, executor.Config, OffPolicy):
+    """Settings; those of the coordinator are the source's."""
+
+    kind: Literal["hitmac"] = "hitmac"
+    executor: Literal["gumbel", "expected"] = Field("expected", description="actor's gradient, as in `rhmc.executor`")
+    pretrain: int = Field(500_000, ge=0, description="environment steps in which the executors learn")
+
+
+class HiTMAC:
+    """See the module. Discrete actions only. Assignments are (B, N, M) float, 0 or 1."""
+
+    def __init__(self, cfg: Config, spec: Spec, num_envs: int, rng: Generator) -> None:
+        self.cfg, self.spec, self.rng = cfg, spec, rng
+        self.executor = executor.Executor(cfg, spec, rng)
+        self.coordinator = attention.Coordinator(cfg, spec, rng)
+        self.practised, self.decisions = Experience(cfg, rng), Decisions(cfg.rollout, rng.device)
+        self.pending: Batch = {}  # the half-done assignment period of each environment
+
+    @property
+    def practising(self) -> bool:
+        """Whether the executors still learn."""
+        return self.practised.steps < self.cfg.pretrain
+
+    # Acting
+
+    def carry(self, batch: int) -> Carry:
+        """The assignment held, and for how many steps by the coordinator's word."""
+        dev = self.rng.device
+        held = torch.zeros(batch, self.spec.agents, self.spec.targets, device=dev)
+        return {"assignment": held, "age": torch.zeros(batch, dtype=torch.int64, device=dev)}
+
+    def act(self, obs: Obs, carry: Carry, rng: Generator, *, explore: bool) -> tuple[Tensor, Carry, Batch]:
+        """Assign where an episode or a period starts, then act on the filtered observation."""
+        held, age = carry["assignment"], carry["age"]
+        if explore and self.practising:
+            extra = {"assignment": practice(obs.first, held, rng)}
+            action = self.executor.act(obs, extra["assignment"], rng, explore=True)
+            return action, extra | {"age": torch.zeros_like(age)}, extra
+        new = obs.first | (age % self.cfg.assignment_period == 0)
+        chance = torch.zeros_like(held)
+        if bool(new.any()):
+            drawn, chance = self.coordinator.assign(obs, rng, explore=explore)
+            held = torch.where(new.view(-1, 1, 1), drawn, held)
+        after = {"assignment": held, "age": torch.where(new, 0, age) + 1}
+        action = self.executor.act(obs, held, rng, explore=False)
+        return action, after, {"assignment": held, "new": new, "chance": chance}
+
+    # Learning
+
+    def observe(self, transition: Transition) -> None:
+        """Store a row for the executors; after their time, the coordinator's rows of the periods that end now."""
+        t, extra = transition, transition.extra
+        if self.practising:
+            return self.practised.add(self.executor.rows(t, extra["assignment"]), len(t.reward))
+        self.coordinator.standard.see_rewards(t.reward)
+        none = torch.zeros_like(t.reward)
+        start = pack(t.obs) | {key: extra[key] for key in ("assignment", "chance")} | {"reward": none, "length": none}
+        self.pending = p = choose(extra["new"], start, self.pending or start)
+        p["reward"] = p["reward"] + self.coordinator.standard.reward(t.reward) / self.cfg.assignment_period
+        p["length"] = p["length"] + 1
+        over = t.terminal | t.truncated
+        done = over | (p["length"] >= self.cfg.assignment_period)
+        return self.decisions.add(p | pack(t.next_obs, "next_") | {"terminal": t.terminal, "ended": over}, done)
+
+    def update(self) -> Batch:
+        """The executors' updates that are due; when they are frozen, all epochs of the coordinator's full rollout."""
+        logs: Batch = {}
+        for rows in self.practised.due():
+            logs = self.executor.update(rows)
+        if not self.practising:
+            self.practised.replay = Replay(self.cfg.buffer, self.rng)  # of no more use
+            rollout = self.decisions.take()
+            logs |= self.coordinator.learn(rollout) if rollout else {}
+        return logs
+
+    # Checkpoints
+
+    def _parts(self) -> dict[str, checkpoint.Part]:
+        levels: dict[str, checkpoint.Part] = {"coordinator": self.coordinator, "executor": self.executor}
+        return levels | {"practised": self.practised, "decisions": self.decisions}
+
+    def state_dict(self) -> State:
+        """Both levels, the executors' replay while they learn, the rollout, half-done periods and generator."""
+        return checkpoint.save(self.rng, self._parts()) | {"pending": self.pending}
+
+    def load_state_dict(self, state: State) -> None:
+        """Continue from `state_dict`."""
+        checkpoint.load(state, self.rng, self._parts())
+        self.pending = {key: value.to(self.rng.device) for key, value in state["pending"].items()}
+
+
+class Decisions:
+    """The latest assignments of every environment with what came of them, until one has made `length` of them."""
+
+    def __init__(self, length: int, device: torch.device) -> None:
+        self.length, self.device = length, device
+        self.rows: Batch = {}  # (length, B, ...)
+        self.count = torch.zeros(0, dtype=torch.int64)  # (B,) assignments kept
+
+    def add(self, rows: Batch, done: Tensor) -> None:
+        """Keep the rows (B, ...) of the environments where `done`."""
+        if not bool(done.any()):
+            return
+        if not self.rows:
+            self.rows = {key: value.new_zeros(self.length, *value.shape) for key, value in rows.items()}
+            self.count = torch.zeros(len(done), dtype=torch.int64, device=self.device)
+        where = done.nonzero().squeeze(1)
+        for key, value in rows.items():
+            self.rows[key][self.count[where], where] = value[where]
+        self.count = self.count + done
+
+    def take(self) -> Batch | None:
+        """All rows once an environment has `length`: those `filled` (length, B), the last of each marked `ended`."""
+        if not len(self.count) or int(self.count.max()) < self.length:
+            return None
+        place = torch.arange(self.length, device=self.device).unsqueeze(1)
+        rows = self.rows | {"filled": place < self.count, "ended": self.rows["ended"] | (place >= self.count - 1)}
+        self.rows, self.count = {}, self.count[:0]
+        return rows
+
+    def state_dict(self) -> State:
+        """The rows kept so far."""
+        return {"rows": self.rows, "count": self.count}
+
+    def load_state_dict(self, state: State) -> None:
+        """Continue from `state_dict`."""
+        self.rows = {key: value.to(self.device, copy=True) for key, value in state["rows"].items()}
+        self.count = state["count"].to(self.device)
+
+
+def practice(first: Tensor, held: Tensor, rng: Generator) -> Tensor:
+    """Random assignments, drawn anew at the `first` step of an episode and every `PRACTISED` steps on average.
+
+    Every number of targets is as likely for an agent as any other: what a coordinator may want is not known yet.
+    """
+    draw = torch.rand(*held.shape[:2], held.shape[2] + 1, generator=rng, device=rng.device)
+    drawn = (draw[..., 1:] < draw[..., :1]).float()
+    new = first | (torch.rand(len(first), generator=rng, device=rng.device) < 1 / PRACTISED)
+    return torch.where(new.view(-1, 1, 1), drawn, held)
