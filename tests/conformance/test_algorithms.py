@@ -652,7 +652,7 @@ LEARNING = {  # of the tiny task; the rest are a method's defaults
 }
 LEARNING_OF: dict[str, dict[str, Any]] = {  # what a method needs beside or instead of that
     "maddpg": {"gamma": 0.6, "penalty": 1e-2, "batch": 128, "steps_per_update": 16},
-    "coma": {"gamma": 0.6, "entropy": 0.05, "hidden": 64, "lr": 3e-3, "minibatches": 8},
+    "coma": {"gamma": 0.6, "entropy": 0.05, "epsilon": 0.1, "hidden": 64, "lr": 3e-3, "minibatches": 8},
     "hitmac": {"gamma": 0.5, "hidden": 64, "lr": 3e-3},
 }
 STEPS = {"coma": 18_000, "hitmac": 14_000}  # 12 000 else
