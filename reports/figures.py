@@ -24,6 +24,7 @@ from reports.tables import describe_task, joined, number, readable, seeds, steps
 LOOKS: Mapping[str, tuple[str, str]] = {
     "full": ("#0072B2", "-"),
     "RHMC": ("#0072B2", "-"),
+    "RHMC, team reward": ("#0072B2", "--"),
     "no regulation": ("#D55E00", "-"),
     "no filter": ("#009E73", "-"),
     "HiT-MAC": ("#D55E00", "-"),

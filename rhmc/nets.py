@@ -127,10 +127,11 @@ class _PairBody(nn.Module):
         self.second = nn.Linear(hidden, hidden)
 
     def forward(self, obs: Obs) -> Tensor:
-        h = self.pair(obs.pairs)
+        rows = obs.pairs.shape[:3]
+        h = self.pair(obs.pairs.flatten(0, 2))  # rows: ReLU in place on a view would copy whole gradients
         if self.agent is not None:
-            h = h + self.agent(obs.agents).unsqueeze(2)
-        return self.second(h.relu_()).relu_()
+            h = (h.unflatten(0, rows) + self.agent(obs.agents).unsqueeze(2)).flatten(0, 2)
+        return self.second(h.relu_()).relu_().unflatten(0, rows)
 
 
 class _AgentBody(nn.Module):

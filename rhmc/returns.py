@@ -20,7 +20,7 @@ def gae(
 ) -> Tensor:
     """Generalised advantage estimates (Schulman et al. 2016, eq. 16)."""
     error = reward + gamma * following * ~terminal - value
-    keep = gamma * lam * ~ended
+    keep = gamma * lam * (~ended).to(error.dtype)
     advantage, after = torch.empty_like(error), torch.zeros_like(error[0])
     for t in reversed(range(len(error))):
         after = advantage[t] = error[t] + keep[t] * after

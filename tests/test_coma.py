@@ -1,6 +1,7 @@
 """COMA's advantage, targets and gradients against values worked out by hand."""
 
 from collections.abc import Callable
+from copy import deepcopy
 from typing import Any
 
 import pytest
@@ -12,6 +13,7 @@ from torch import Generator, Tensor, nn
 from rhmc.algorithms.coma import COMA, Config, draw, expected, taken
 from rhmc.experience import flat
 from rhmc.types import Batch, Local, Obs, Spec, Transition
+from tests.conformance import assert_same
 
 SPEC = Spec(2, 3, agent_features=1, pair_features=4, peer_features=0, actions=3, continuous=False, episode=9)
 N, M, ACTIONS = SPEC.agents, SPEC.targets, SPEC.actions
@@ -236,6 +238,39 @@ def test_standardised_returns_give_the_critics_outputs_their_scale() -> None:
     target, _ = algo._judged(whole(algo, transition(algo, [[0, 1]], 4.0)))
     assert target.flatten().tolist() == pytest.approx([15.0, 15.0])  # 4 + (6 * 2 + 10)/2
     assert algo.standard.target(target).flatten().tolist() == pytest.approx([2.5, 2.5])
+
+
+def test_what_the_critic_learns_is_standardised_by_the_returns_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """These count as seen before they are a target: the first rollout's have mean 0 and deviation 1 themselves."""
+    algo, seen = method(rollout=2, standardise="return", minibatches=1, epochs=1), []
+    real = algo._critic_loss
+
+    def spy(rows: Batch) -> Any:
+        seen.append(rows["target"])
+        return real(rows)
+
+    monkeypatch.setattr(algo, "_critic_loss", spy)
+    for reward in (30.0, 50.0):
+        algo.observe(transition(algo, [[0, 1], [1, 2]], reward, after="over"))
+    algo.update()
+    assert seen[0].shape == (4, N)
+    assert sorted(seen[0].flatten().tolist()) == pytest.approx([-1.0] * 4 + [1.0] * 4, abs=1e-3)
+
+
+@pytest.mark.parametrize("standardise", ["reward", "return"])
+def test_a_checkpoint_holds_what_was_seen_and_the_half_of_a_rollout(standardise: str) -> None:
+    first, other = (method(rollout=2, standardise=standardise) for _ in range(2))
+    steps = [transition(first, [[0, 1], [1, 2]], reward) for reward in (5.0, 1.0, 7.0, 3.0, 9.0)]
+    for t in steps[:3]:
+        first.observe(t)
+        first.update()
+    torch.manual_seed(7)
+    other.load_state_dict(deepcopy(first.state_dict()))
+    for algo in (first, other):
+        for t in steps[3:]:
+            algo.observe(t)
+            algo.update()
+    assert_same(first.state_dict(), other.state_dict())
 
 
 def test_the_critic_learns_the_value_of_the_action_taken() -> None:

@@ -235,7 +235,7 @@ def test_what_the_critic_learns_is_standardised_after_it_was_counted_in() -> Non
 def test_an_actor_follows_the_slope_of_its_own_action_alone(continuous: bool) -> None:
     """The others' actions are those of the replay: Q's 10 times all first parts move nobody."""
     output = torch.tensor([[0.3, -0.2], [0.0, 0.4], [-0.6, 0.1]])
-    algo, batch = method(continuous, penalty=0.01), rows(continuous, batch=4000)
+    algo, batch = method(continuous, penalty=3.0), rows(continuous, batch=4000)
     actor, critic = Actor(output), Critic()
     algo.actor.net, algo.critic.net = actor, critic
     loss, _ = algo._actor_loss(batch)
@@ -251,7 +251,7 @@ def test_an_actor_follows_the_slope_of_its_own_action_alone(continuous: bool) ->
     else:  # the mean over the noise of the soft draw's gradient
         soft = (output + gumbel(Size((100_000, N, A)), seeded(5))).softmax(-1)
         gain = (soft * (slope - (soft * slope).sum(-1, keepdim=True))).mean(0)
-    assert torch.allclose(found, 0.01 * 2 * output / (N * A) - gain / N, atol=3e-3)
+    assert torch.allclose(found, 3.0 * 2 * output / (N * A) - gain / N, atol=3e-3)
 
 
 @both

@@ -87,7 +87,9 @@ def test_td_lambda_is_the_weighted_sum_of_all_returns_ahead(
 ) -> None:
     rows = rows_of(codes, seed)
     got = td_lambda(rows.reward, rows.following, rows.terminal, rows.ended, gamma, lam)
-    assert torch.allclose(got, rows.each(lambda rows, t, b: lambda_return(rows, t, b, gamma, lam)), atol=1e-12)
+    assert torch.allclose(
+        got, rows.each(lambda rows, t, b: lambda_return(rows, t, b, gamma, lam)), rtol=1e-12, atol=1e-12
+    )
 
 
 @everything
@@ -96,7 +98,7 @@ def test_n_step_counts_rewards_up_to_the_end(codes: list[list[int]], seed: int, 
     rows = rows_of(codes, seed)
     got = n_step(rows.reward, rows.following, rows.terminal, rows.ended, gamma, n)
     want = rows.each(lambda rows, t, b: some_steps(rows, t, b, min(n, rows.reach(t, b)), gamma))
-    assert torch.allclose(got, want, atol=1e-12)
+    assert torch.allclose(got, want, rtol=1e-12, atol=1e-12)
 
 
 @everything
@@ -106,7 +108,7 @@ def test_gae_is_the_discounted_sum_of_errors_up_to_the_end(
 ) -> None:
     rows = rows_of(codes, seed)
     got = gae(*rows, gamma, lam)
-    assert torch.allclose(got, rows.each(lambda rows, t, b: advantage(rows, t, b, gamma, lam)), atol=1e-12)
+    assert torch.allclose(got, rows.each(lambda rows, t, b: advantage(rows, t, b, gamma, lam)), rtol=1e-12, atol=1e-12)
 
 
 @everything
@@ -119,7 +121,7 @@ def test_gae_and_the_lambda_return_say_the_same_where_values_agree(
     value = rows.value.clone()
     value[1:] = torch.where(rows.ended[:-1], value[1:], rows.following[:-1])
     target = td_lambda(rows.reward, rows.following, rows.terminal, rows.ended, gamma, lam)
-    assert torch.allclose(gae(*rows._replace(value=value), gamma, lam) + value, target, atol=1e-12)
+    assert torch.allclose(gae(*rows._replace(value=value), gamma, lam) + value, target, rtol=1e-12, atol=1e-12)
 
 
 @everything
