@@ -5,7 +5,6 @@ every pair a logit. `Contributions` values a state as the sum of what each pair 
 after the Shapley value: one pass over the pairs for any order, by running sums.
 """
 
-from collections.abc import Iterator
 from typing import Literal
 
 import torch
@@ -14,7 +13,7 @@ from torch import Generator, Tensor, nn
 from torch.nn.functional import logsigmoid, mse_loss, scaled_dot_product_attention, softplus
 
 from rhmc import checkpoint
-from rhmc.experience import flat, values
+from rhmc.experience import flat, minibatches, values
 from rhmc.learner import Learner, unpack
 from rhmc.nets import ENCODERS, EncoderName, Sizes, mlp
 from rhmc.ppo import normalised
@@ -109,7 +108,7 @@ class Coordinator:
     def learn(self, rollout: Batch) -> Batch:
         """All epochs on a rollout: rows (T, B, ...) as `decisions` of `rhmc.algorithms.hitmac` keeps them."""
         logs: Batch = {}
-        for rows in self._minibatches(self.judge(rollout)):
+        for rows in minibatches(self.judge(rollout), self.cfg.epochs, self.cfg.minibatches, self.rng):
             logs = self.improve(rows)
         return logs
 
@@ -126,12 +125,6 @@ class Coordinator:
         data = {key: value[data["filled"]] for key, value in data.items()}
         self.standard.see_returns(data["target"])
         return data | {"advantage": normalised(data["advantage"]), "target": self.standard.target(data["target"])}
-
-    def _minibatches(self, rows: Batch) -> Iterator[Batch]:
-        count = len(rows["target"])
-        for _ in range(self.cfg.epochs):
-            for index in torch.randperm(count, generator=self.rng, device=self.rng.device).chunk(self.cfg.minibatches):
-                yield {key: value[index] for key, value in rows.items()}
 
     def improve(self, rows: Batch) -> Batch:
         """One step of the critic and one of the actor; no gain from a pair's ratio further than `clip` from 1."""

@@ -15,7 +15,7 @@ from torch import Generator, Tensor
 from torch.nn.functional import mse_loss, one_hot
 
 from rhmc.filters import FILTERS
-from rhmc.learner import Learner, pack, unpack
+from rhmc.learner import Learner, pack_step, taken, unpack
 from rhmc.nets import ENCODERS, Sizes, append, team
 from rhmc.sampling import gumbel, mix, straight_through
 from rhmc.settings import Slow
@@ -62,14 +62,13 @@ class Executor:
 
     def rows(self, t: Transition, assignment: Tensor) -> Batch:
         """One row per environment of Alg. 2's B_l."""
-        rows = pack(t.obs) | pack(t.next_obs, "next_") | {"action": t.action, "terminal": t.terminal}
-        return rows | {"assignment": assignment, "reward": self.paid(t, assignment)}
+        return pack_step(t) | {"assignment": assignment, "reward": self.paid(t, assignment)}
 
     def update(self, rows: Batch) -> Batch:
         """One step of the critic (Eq. 11) and one of the actor (Eq. 13, ascent)."""
         g, obs, joint = rows["assignment"], unpack(rows), self._one_hot(rows["action"])
         q = self.critic.net(_told(obs, g), joint=joint)
-        chosen = q.gather(-1, rows["action"].unsqueeze(-1)).squeeze(-1)
+        chosen = taken(q, rows["action"])
         td = mse_loss(chosen, self._target(rows))
         logits = self.actor.net(self._seen(obs, g))
         gain = (q.detach() * self.policy(logits)).sum(-1).mean()
@@ -82,7 +81,7 @@ class Executor:
     def _target(self, rows: Batch) -> Tensor:
         g, after = rows["assignment"], unpack(rows, "next_")
         best = self.actor.slow(self._seen(after, g)).argmax(-1)
-        value = self.critic.slow(_told(after, g), joint=self._one_hot(best)).gather(-1, best.unsqueeze(-1)).squeeze(-1)
+        value = taken(self.critic.slow(_told(after, g), joint=self._one_hot(best)), best)
         return rows["reward"] + self.cfg.gamma_l * (~rows["terminal"]).unsqueeze(-1) * value
 
     def _seen(self, obs: Obs, assignment: Tensor) -> Obs:

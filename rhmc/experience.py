@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 import torch
 from torch import Generator, Tensor
 
-from rhmc.learner import Replay, pack, unpack
+from rhmc.learner import Replay, pack_step, unpack
 from rhmc.settings import OffPolicy
 from rhmc.types import Batch, Obs, State, Transition
 
@@ -48,8 +48,7 @@ class Rollout:
 
     def add(self, t: Transition, **more: Tensor) -> None:
         """Keep one step of B environments, and what else is needed of it, (B, ...) each."""
-        rows = pack(t.obs) | pack(t.next_obs, "next_") | {"action": t.action, "reward": t.reward}
-        self.rows.append(rows | {"terminal": t.terminal, "ended": t.terminal | t.truncated} | more)
+        self.rows.append(pack_step(t) | {"ended": t.terminal | t.truncated} | more)
 
     def take(self) -> Batch | None:
         """All rows as (T, B, ...) once there are T = `length` of them; the next rollout then starts."""
@@ -70,6 +69,14 @@ class Rollout:
 def flat(rows: Batch) -> Batch:
     """(T, B, ...) -> (T B, ...)."""
     return {key: value.flatten(0, 1) for key, value in rows.items()}
+
+
+def minibatches(rows: Batch, epochs: int, parts: int, rng: Generator) -> Iterator[Batch]:
+    """In every epoch all rows (K, ...) once, in a drawn order, as `parts` batches."""
+    count = len(next(iter(rows.values())))
+    for _ in range(epochs):
+        for index in torch.randperm(count, generator=rng, device=rng.device).chunk(parts):
+            yield {key: value[index] for key, value in rows.items()}
 
 
 def ends(rows: Batch) -> tuple[Tensor, Obs]:

@@ -6,7 +6,7 @@ from typing import Generic, TypeVar
 import torch
 from torch import Generator, Tensor, nn
 
-from rhmc.types import Batch, Obs, State
+from rhmc.types import Batch, Obs, State, Transition
 
 Net = TypeVar("Net", bound=nn.Module)
 
@@ -107,6 +107,17 @@ def unpack(rows: Batch, prefix: str = "") -> Obs:
     pairs = rows[f"{prefix}pairs"]
     first = torch.zeros(len(pairs), dtype=torch.bool, device=pairs.device)
     return Obs(rows[f"{prefix}agents"], pairs, rows[f"{prefix}peers"], first)
+
+
+def pack_step(t: Transition) -> Batch:
+    """One acted step as rows, (B, ...) each: what was seen before and after, action, reward, terminal."""
+    rows = {"action": t.action, "reward": t.reward, "terminal": t.terminal}
+    return pack(t.obs) | pack(t.next_obs, "next_") | rows
+
+
+def taken(values: Tensor, action: Tensor) -> Tensor:
+    """The values (B, N, actions) of the actions taken (B, N)."""
+    return values.gather(-1, action.unsqueeze(-1)).squeeze(-1)
 
 
 def choose(mask: Tensor, new: Batch, old: Batch) -> Batch:

@@ -6,7 +6,7 @@ critic's targets (Schulman et al. 2016 and 2017). `objective` says what keeps th
 weight doubles or halves when the divergence misses its target (2017, section 4).
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable
 from typing import Literal, Protocol
 
 import torch
@@ -15,8 +15,8 @@ from torch import Generator, Tensor, nn
 from torch.nn.functional import huber_loss
 
 from rhmc import checkpoint
-from rhmc.experience import Rollout, flat, values
-from rhmc.learner import Learner, unpack
+from rhmc.experience import Rollout, flat, minibatches, values
+from rhmc.learner import Learner, taken, unpack
 from rhmc.nets import ENCODERS, Sizes, team
 from rhmc.returns import gae
 from rhmc.sampling import gumbel
@@ -167,15 +167,11 @@ class PPO:
         kept |= {"advantage": normalised(advantage), "target": self.standard.target(target)}
         return flat(kept), {"value": value.mean(), "explained": 1 - advantage.var() / target.var()}
 
-    def _minibatches(self, rows: Batch) -> Iterator[Batch]:
+    def _minibatches(self, rows: Batch) -> Iterable[Batch]:
         """Every row once per epoch; without a draw where a pass is one update."""
-        count, device = len(rows["action"]), self.rng.device
-        for _ in range(self.cfg.epochs):
-            if self.cfg.minibatches == 1:
-                yield rows
-                continue
-            for index in torch.randperm(count, generator=self.rng, device=device).chunk(self.cfg.minibatches):
-                yield {key: value[index] for key, value in rows.items()}
+        if self.cfg.minibatches == 1:
+            return [rows] * self.cfg.epochs
+        return minibatches(rows, self.cfg.epochs, self.cfg.minibatches, self.rng)
 
     def _improve(self, rows: Batch) -> Batch:
         policy = self._policy(unpack(rows))
@@ -223,8 +219,7 @@ def orthogonal(net: nn.Module, gain: float) -> nn.Module:
 
 def ratio(new: Tensor, old: Tensor, action: Tensor) -> Tensor:
     """How much likelier an action (B, N) has become, from log-policies (B, N, actions): (B, N)."""
-    index = action.unsqueeze(-1)
-    return (new.gather(-1, index) - old.gather(-1, index)).squeeze(-1).exp()
+    return (taken(new, action) - taken(old, action)).exp()
 
 
 def kl(old: Tensor, new: Tensor) -> Tensor:

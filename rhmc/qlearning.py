@@ -12,7 +12,7 @@ from torch.nn.functional import mse_loss
 
 from rhmc import checkpoint
 from rhmc.experience import Experience
-from rhmc.learner import Learner, pack, unpack
+from rhmc.learner import Learner, pack_step, taken, unpack
 from rhmc.nets import ENCODERS, Sizes, team
 from rhmc.schedules import linear
 from rhmc.settings import OffPolicy, Slow, Standardised
@@ -40,7 +40,7 @@ class Values(nn.Module):
 
     def mixed(self, obs: Obs, action: Tensor) -> Tensor:
         """Mixed values of a joint action (B, N): (B, K)."""
-        return self.mixer(obs, self(obs).gather(-1, action.unsqueeze(-1)).squeeze(-1))
+        return self.mixer(obs, taken(self(obs), action))
 
 
 class QLearning:
@@ -75,9 +75,8 @@ class QLearning:
     def observe(self, transition: Transition) -> None:
         """Store one row per environment."""
         t = transition
-        rows = {"action": t.action, "reward": t.reward, "terminal": t.terminal}
         self.standard.see_rewards(t.reward)
-        self.experience.add(rows | pack(t.obs) | pack(t.next_obs, "next_"), len(t.reward))
+        self.experience.add(pack_step(t), len(t.reward))
 
     def update(self) -> Batch:
         """The updates that are due."""

@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Generator, Tensor, nn
 
-from rhmc.algorithms.coma import COMA, Config, draw, expected, taken
+from rhmc.algorithms.coma import COMA, Config, draw, expected
 from rhmc.experience import flat
+from rhmc.learner import taken
 from rhmc.types import Batch, Local, Obs, Spec, Transition
 from tests.conformance import assert_same
 

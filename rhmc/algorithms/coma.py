@@ -11,7 +11,6 @@ standardised; an entropy bonus beside the floor of the chances, which is constan
 a slow critic by polyak averaging, which also gives the baseline; truncation bootstraps (`trainer.time_limit`).
 """
 
-from collections.abc import Iterator
 from typing import Literal
 
 import torch
@@ -21,8 +20,8 @@ from torch.nn.functional import mse_loss, one_hot
 
 from rhmc import checkpoint
 from rhmc.algorithms.base import About
-from rhmc.experience import Rollout, ends, flat
-from rhmc.learner import Learner, unpack
+from rhmc.experience import Rollout, ends, flat, minibatches
+from rhmc.learner import Learner, taken, unpack
 from rhmc.nets import ENCODERS, Sizes, team
 from rhmc.returns import td_lambda
 from rhmc.sampling import mix
@@ -111,21 +110,15 @@ class COMA:
         target, advantage = self._judged(rollout)
         self.standard.see_returns(target)
         rows = flat(rollout | {"target": self.standard.target(target), "advantage": advantage})
+        rows = {key: value for key, value in rows.items() if not key.startswith("next_")}
         logs: Batch = {}
-        for part in self._minibatches(rows, self.cfg.epochs, self.cfg.minibatches):
+        for part in minibatches(rows, self.cfg.epochs, self.cfg.minibatches, self.rng):
             loss, logs = self._critic_loss(part)
             logs["critic_norm"] = self.critic.update(loss)
-        for part in self._minibatches(rows, 1, self.cfg.actor_minibatches):
+        for part in minibatches(rows, 1, self.cfg.actor_minibatches, self.rng):
             loss, more = self._actor_loss(part)
             logs |= more | {"grad_norm": self.actor.update(loss)}
         return logs
-
-    def _minibatches(self, rows: Batch, epochs: int, parts: int) -> Iterator[Batch]:
-        count = len(rows["reward"])
-        for _ in range(epochs):
-            order = torch.randperm(count, generator=self.rng, device=self.rng.device)
-            for part in order.chunk(parts):
-                yield {key: rows[key][part] for key in rows if not key.startswith("next_")}
 
     @torch.no_grad()
     def _judged(self, rollout: Batch) -> tuple[Tensor, Tensor]:
@@ -182,11 +175,6 @@ class COMA:
 def draw(chance: Tensor, rng: Generator) -> Tensor:
     """Actions (B, N) from their chances (B, N, actions)."""
     return torch.multinomial(chance.flatten(0, 1), 1, generator=rng).view(chance.shape[:2])
-
-
-def taken(values: Tensor, action: Tensor) -> Tensor:
-    """The values (B, N, actions) of the actions taken (B, N)."""
-    return values.gather(-1, action.unsqueeze(-1)).squeeze(-1)
 
 
 def expected(q: Tensor, chance: Tensor) -> Tensor:

@@ -21,7 +21,7 @@ from rhmc import checkpoint
 from rhmc.algorithms.base import About
 from rhmc.experience import Experience
 from rhmc.heads import Continuous, Discrete, Head
-from rhmc.learner import Learner, pack, unpack
+from rhmc.learner import Learner, pack_step, unpack
 from rhmc.nets import ENCODERS, Sizes, team
 from rhmc.settings import OffPolicy, Slow, Standardised
 from rhmc.standardise import Standard
@@ -81,9 +81,8 @@ class MADDPG:
     def observe(self, transition: Transition) -> None:
         """Store one row per environment."""
         t = transition
-        rows = {"action": t.action, "reward": t.reward, "terminal": t.terminal}
         self.standard.see_rewards(t.reward)
-        self.experience.add(rows | pack(t.obs) | pack(t.next_obs, "next_"), len(t.reward))
+        self.experience.add(pack_step(t), len(t.reward))
 
     def update(self) -> Batch:
         """The updates that are due: one step of the critic, then one of the actor."""
