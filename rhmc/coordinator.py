@@ -15,11 +15,12 @@ from torch.nn.functional import mse_loss, softplus
 from rhmc.learner import Learner, unpack
 from rhmc.nets import ENCODERS, PairNet, Sizes, append
 from rhmc.sampling import bernoulli, mix, relaxed_bernoulli
-from rhmc.settings import Slow
+from rhmc.settings import Scaled, Slow
+from rhmc.standardise import Standard
 from rhmc.types import Batch, Obs, Spec, State
 
 
-class Config(Slow):
+class Config(Slow, Scaled):
     """Settings of the high level; lr and gamma are the paper's."""
 
     coordinator: Literal["ddpg", "counterfactual"] = "ddpg"
@@ -40,6 +41,7 @@ class Coordinator:
         critic = encoder.pairs(Sizes.of(spec, pair=1), cfg.hidden, 1).to(rng.device)
         self.actor = Learner(actor, lr=cfg.lr, polyak=cfg.polyak, clip=cfg.grad_clip)
         self.critic = Learner(critic, lr=cfg.lr, polyak=cfg.polyak, clip=cfg.grad_clip)
+        self.standard = Standard(cfg.standardise, rng.device)
 
     def assign(self, obs: Obs, rng: Generator, *, explore: bool) -> Tensor:
         """Assignment (B, N, M): drawn from the softened policy, or its threshold at 1/2."""
@@ -54,9 +56,11 @@ class Coordinator:
         with torch.no_grad():
             best = (self.actor.slow(after).squeeze(-1) > 0).float()
             live = (~rows["terminal"]).float()
-            target = rows["reward"] + self.cfg.gamma_h * live * worth(self.critic.slow, after, best)
+            value = self.standard.value(worth(self.critic.slow, after, best))
+            target = self.standard.reward(rows["reward"]) + self.cfg.gamma_h * live * value
+            self.standard.see_returns(target)
         q = worth(self.critic.net, obs, rows["assignment"])
-        td = mse_loss(q, target)
+        td = mse_loss(q, self.standard.target(target))
         self.critic.update(td)
         logits = self.actor.net(obs).squeeze(-1)
         self.actor.update(-self.gain(obs, logits))
@@ -78,12 +82,13 @@ class Coordinator:
 
     def state_dict(self) -> State:
         """Both networks."""
-        return {"actor": self.actor.state_dict(), "critic": self.critic.state_dict()}
+        return {"actor": self.actor.state_dict(), "critic": self.critic.state_dict(), "standard": self.standard.state_dict()}
 
     def load_state_dict(self, state: State) -> None:
         """Continue from `state_dict`."""
         self.actor.load_state_dict(state["actor"])
         self.critic.load_state_dict(state["critic"])
+        self.standard.load_state_dict(state["standard"])
 
 
 def worth(critic: nn.Module, obs: Obs, assignment: Tensor) -> Tensor:

@@ -18,16 +18,19 @@ from rhmc.filters import FILTERS
 from rhmc.learner import Learner, pack_step, taken, unpack
 from rhmc.nets import ENCODERS, Sizes, append, team
 from rhmc.sampling import gumbel, mix, straight_through
-from rhmc.settings import Slow
+from rhmc.settings import Scaled, Slow
+from rhmc.standardise import Standard
 from rhmc.types import Batch, Obs, Spec, State, Transition, assigned_reward
 
 
-class Config(Slow):
+class Config(Slow, Scaled):
     """Settings of the low level; lr and gamma are the paper's."""
 
     filter: Literal["on", "off"] = Field("on", description="hide unassigned targets from the executors (Eq. 10)")
-    executor: Literal["gumbel", "expected"] = Field(
-        "gumbel", description="actor's gradient: straight-through Gumbel-softmax, or the expectation over own actions"
+    executor: Literal["gumbel", "expected", "mixed"] = Field(
+        "gumbel",
+        description="an actor with a straight-through Gumbel-softmax, or with the expectation over own actions; or no "
+        "actor: the best of own values, learned through a mixture (`rhmc.mixed`)",
     )
     low_reward: Literal["local", "team"] = Field(
         "local", description="what the executors are paid: their scores on assigned targets, or the team's reward"
@@ -43,7 +46,7 @@ class Executor:
 
     def __init__(self, cfg: Config, spec: Spec, rng: Generator) -> None:
         self.cfg, self.actions = cfg, spec.actions
-        self.filter, self.paid = FILTERS[cfg.filter], PAID[cfg.low_reward]
+        self.filter, self.paid = cfg.filter, PAID[cfg.low_reward]
         policies = {"gumbel": partial(straight_through, rng=rng), "expected": partial(torch.softmax, dim=-1)}
         self.policy: Callable[[Tensor], Tensor] = policies[cfg.executor]
         encoder, sizes = ENCODERS[cfg.encoder], Sizes.of(spec, pair=1)
@@ -52,25 +55,30 @@ class Executor:
         actor, critic = (team(make, spec.agents, share=cfg.share).to(rng.device) for make in (local, central))
         self.actor = Learner(actor, lr=cfg.lr, polyak=cfg.polyak, clip=cfg.grad_clip)
         self.critic = Learner(critic, lr=cfg.lr, polyak=cfg.polyak, clip=cfg.grad_clip)
+        self.standard = Standard(cfg.standardise, rng.device)
 
     def act(self, obs: Obs, assignment: Tensor, rng: Generator, *, explore: bool) -> Tensor:
         """Actions (B, N) int64: sampled from the softened policy, or its greatest logit."""
-        logits = self.actor.net(self._seen(obs, assignment))
+        logits = self.actor.net(seen(self.filter, obs, assignment))
         if explore:
             logits = mix(logits.softmax(-1), 1 / self.actions, self.cfg.epsilon).log() + gumbel(logits.shape, rng)
         return logits.argmax(-1)
 
     def rows(self, t: Transition, assignment: Tensor) -> Batch:
         """One row per environment of Alg. 2's B_l."""
-        return pack_step(t) | {"assignment": assignment, "reward": self.paid(t, assignment)}
+        reward = self.paid(t, assignment)
+        self.standard.see_rewards(reward)
+        return pack_step(t) | {"assignment": assignment, "reward": reward}
 
     def update(self, rows: Batch) -> Batch:
         """One step of the critic (Eq. 11) and one of the actor (Eq. 13, ascent)."""
         g, obs, joint = rows["assignment"], unpack(rows), self._one_hot(rows["action"])
-        q = self.critic.net(_told(obs, g), joint=joint)
+        q = self.critic.net(told(obs, g), joint=joint)
         chosen = taken(q, rows["action"])
-        td = mse_loss(chosen, self._target(rows))
-        logits = self.actor.net(self._seen(obs, g))
+        target = self._target(rows)
+        self.standard.see_returns(target)
+        td = mse_loss(chosen, self.standard.target(target))
+        logits = self.actor.net(seen(self.filter, obs, g))
         gain = (q.detach() * self.policy(logits)).sum(-1).mean()
         self.critic.update(td)
         self.actor.update(self.cfg.logit_penalty * logits.square().mean() - gain)
@@ -80,28 +88,32 @@ class Executor:
     @torch.no_grad()
     def _target(self, rows: Batch) -> Tensor:
         g, after = rows["assignment"], unpack(rows, "next_")
-        best = self.actor.slow(self._seen(after, g)).argmax(-1)
-        value = taken(self.critic.slow(_told(after, g), joint=self._one_hot(best)), best)
-        return rows["reward"] + self.cfg.gamma_l * (~rows["terminal"]).unsqueeze(-1) * value
-
-    def _seen(self, obs: Obs, assignment: Tensor) -> Obs:
-        return _told(obs._replace(pairs=self.filter(obs.pairs, assignment)), assignment)
+        best = self.actor.slow(seen(self.filter, after, g)).argmax(-1)
+        value = self.standard.value(taken(self.critic.slow(told(after, g), joint=self._one_hot(best)), best))
+        return self.standard.reward(rows["reward"]) + self.cfg.gamma_l * (~rows["terminal"]).unsqueeze(-1) * value
 
     def _one_hot(self, action: Tensor) -> Tensor:
         return one_hot(action, self.actions).float()
 
     def state_dict(self) -> State:
         """Both networks."""
-        return {"actor": self.actor.state_dict(), "critic": self.critic.state_dict()}
+        return {"actor": self.actor.state_dict(), "critic": self.critic.state_dict(), "standard": self.standard.state_dict()}
 
     def load_state_dict(self, state: State) -> None:
         """Continue from `state_dict`."""
         self.actor.load_state_dict(state["actor"])
         self.critic.load_state_dict(state["critic"])
+        self.standard.load_state_dict(state["standard"])
 
 
-def _told(obs: Obs, assignment: Tensor) -> Obs:
+def told(obs: Obs, assignment: Tensor) -> Obs:
+    """The observation with the assignment as the last feature of every pair."""
     return append(obs, pair=assignment.unsqueeze(-1))
+
+
+def seen(name: str, obs: Obs, assignment: Tensor) -> Obs:
+    """The same as an executor gets it: behind the filter `name` (Eq. 10)."""
+    return told(obs._replace(pairs=FILTERS[name](obs.pairs, assignment)), assignment)
 
 
 def _local(t: Transition, assignment: Tensor) -> Tensor:

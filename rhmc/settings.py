@@ -24,13 +24,18 @@ class Slow(Networks):
     polyak: float = Field(0.995, ge=0, le=1, description="share of the slow copies kept per update")
 
 
-class Standardised(Frozen):
-    """For methods that learn from one reward and one discount."""
+class Scaled(Frozen):
+    """For whatever learns from rewards."""
 
-    gamma: float = Field(0.99, ge=0, le=1)
     standardise: Literal["none", "reward", "return"] = Field(
         "reward", description="learn from rewards, or predict returns, of mean 0 and deviation 1 (`rhmc.standardise`)"
     )
+
+
+class Standardised(Scaled):
+    """For methods that learn from one reward and one discount."""
+
+    gamma: float = Field(0.99, ge=0, le=1)
 
 
 class OffPolicy(Frozen):

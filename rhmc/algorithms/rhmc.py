@@ -13,7 +13,7 @@ import torch
 from pydantic import Field, model_validator
 from torch import Generator, Tensor
 
-from rhmc import checkpoint, coordinator, executor
+from rhmc import checkpoint, coordinator, executor, mixed
 from rhmc.algorithms.base import About
 from rhmc.experience import Experience
 from rhmc.learner import Replay, choose, pack
@@ -59,7 +59,7 @@ class RHMC:
         self.cfg, self.spec, self.rng = cfg, spec, rng
         self.regulate, self.paid = REGULATORS[cfg.regulator], PAID[cfg.high_reward]
         self.coordinator = coordinator.Coordinator(cfg, spec, rng)
-        self.executor = executor.Executor(cfg, spec, rng)
+        self.executor = EXECUTORS[cfg.executor](cfg, spec, rng)
         self.low, self.high = Experience(cfg, rng), Replay(cfg.buffer, rng)
         self.pending: Batch = {}  # the half-done assignment period of each environment
 
@@ -97,7 +97,9 @@ class RHMC:
         p["earned"] = p["earned"] + self.paid(t, g, cfg.alpha)
         p["length"] = p["length"] + 1
         ended = t.terminal | t.truncated | (p["length"] >= cfg.assignment_period)
-        self.high.add({key: value[ended] for key, value in self._period(t).items()})
+        rows = {key: value[ended] for key, value in self._period(t).items()}
+        self.coordinator.standard.see_rewards(rows["reward"])
+        self.high.add(rows)
 
     def _period(self, t: Transition) -> Batch:
         """Rows of B_h: state, assignment, regulated reward (Alg. 1 against what was earned) and next state."""
@@ -142,4 +144,9 @@ def _team(t: Transition, assignment: Tensor, alpha: float) -> Tensor:
     return t.reward
 
 
+EXECUTORS: dict[str, type[executor.Executor | mixed.MixedExecutor]] = {
+    "gumbel": executor.Executor,
+    "expected": executor.Executor,
+    "mixed": mixed.MixedExecutor,
+}
 PAID = {"assigned": _assigned, "team": _team}
