@@ -14,7 +14,7 @@ from torch.nn.functional import logsigmoid, mse_loss, scaled_dot_product_attenti
 
 from rhmc import checkpoint
 from rhmc.experience import flat, minibatches, values
-from rhmc.learner import Learner, unpack
+from rhmc.learner import Learner, Learners, unpack
 from rhmc.nets import ENCODERS, EncoderName, Sizes, mlp
 from rhmc.ppo import normalised
 from rhmc.returns import gae
@@ -144,17 +144,20 @@ class Coordinator:
         b, n, m, _ = obs.pairs.shape
         return self.critic.net(obs, orders(b, n * m, self.rng))
 
-    def _parts(self) -> dict[str, checkpoint.Part]:
+    def learners(self) -> Learners:
+        """Actor and critic."""
+        return [self.actor, self.critic]
+
+    def _parts(self) -> checkpoint.Parts:
         return {"actor": self.actor, "critic": self.critic, "standard": self.standard}
 
     def state_dict(self) -> State:
         """Networks and statistics; the generator belongs to its owner."""
-        return {name: part.state_dict() for name, part in self._parts().items()}
+        return checkpoint.save_parts(self._parts())
 
     def load_state_dict(self, state: State) -> None:
         """Continue from `state_dict`."""
-        for name, part in self._parts().items():
-            part.load_state_dict(state[name])
+        checkpoint.load_parts(state, self._parts())
 
 
 def orders(batch: int, pairs: int, rng: Generator) -> Tensor:

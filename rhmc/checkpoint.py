@@ -14,13 +14,26 @@ class Part(Protocol):
     def load_state_dict(self, state: Any) -> object: ...
 
 
-def save(rng: Generator, parts: dict[str, Part]) -> State:
+Parts = dict[str, Part]
+
+
+def save(rng: Generator, parts: Parts) -> State:
     """The parts by name, and the generator `rng` that they share."""
-    return {name: part.state_dict() for name, part in parts.items()} | {"rng": rng.get_state()}
+    return save_parts(parts) | {"rng": rng.get_state()}
 
 
-def load(state: State, rng: Generator, parts: dict[str, Part]) -> None:
+def load(state: State, rng: Generator, parts: Parts) -> None:
     """Continue from `save`."""
+    load_parts(state, parts)
+    rng.set_state(state["rng"].cpu())
+
+
+def save_parts(parts: Parts) -> State:
+    """The parts by name, of something whose generator belongs to its owner."""
+    return {name: part.state_dict() for name, part in parts.items()}
+
+
+def load_parts(state: State, parts: Parts) -> None:
+    """Continue from `save_parts`."""
     for name, part in parts.items():
         part.load_state_dict(state[name])
-    rng.set_state(state["rng"].cpu())

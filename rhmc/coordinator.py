@@ -12,20 +12,22 @@ from pydantic import Field
 from torch import Generator, Tensor, nn
 from torch.nn.functional import mse_loss, softplus
 
-from rhmc.learner import Learner, unpack
+from rhmc import checkpoint
+from rhmc.learner import Learner, Learners, unpack
 from rhmc.nets import ENCODERS, PairNet, Sizes, append
 from rhmc.sampling import bernoulli, mix, relaxed_bernoulli
-from rhmc.settings import Scaled, Slow
-from rhmc.standardise import Standard
+from rhmc.settings import Slow
+from rhmc.standardise import Scale, Standard
 from rhmc.types import Batch, Obs, Spec, State
 
 
-class Config(Slow, Scaled):
+class Config(Slow):
     """Settings of the high level; lr and gamma are the paper's."""
 
     coordinator: Literal["ddpg", "counterfactual"] = "ddpg"
     entropy: float = Field(0.2, ge=0, description="weight of the assignment's entropy, for advantages of deviation 1")
     gamma_h: float = Field(0.99, ge=0, le=1, description="per assignment period")
+    standardise_h: Scale = Field("none", description="as `standardise` of other methods, for the coordinator")
     flip: float = Field(0.05, ge=0, le=1, description="share of pairs assigned at random while exploring")
     batch_h: int = Field(256, ge=1, description="rows of an update")
 
@@ -41,7 +43,7 @@ class Coordinator:
         critic = encoder.pairs(Sizes.of(spec, pair=1), cfg.hidden, 1).to(rng.device)
         self.actor = Learner(actor, lr=cfg.lr, polyak=cfg.polyak, clip=cfg.grad_clip)
         self.critic = Learner(critic, lr=cfg.lr, polyak=cfg.polyak, clip=cfg.grad_clip)
-        self.standard = Standard(cfg.standardise, rng.device)
+        self.standard = Standard(cfg.standardise_h, rng.device)
 
     def assign(self, obs: Obs, rng: Generator, *, explore: bool) -> Tensor:
         """Assignment (B, N, M): drawn from the softened policy, or its threshold at 1/2."""
@@ -80,15 +82,20 @@ class Coordinator:
         entropy = softplus(logits) - logits * chance
         return (chance * advantage + self.cfg.entropy * entropy).mean()
 
+    def learners(self) -> Learners:
+        """Actor and critic."""
+        return [self.actor, self.critic]
+
+    def _parts(self) -> checkpoint.Parts:
+        return {"actor": self.actor, "critic": self.critic, "standard": self.standard}
+
     def state_dict(self) -> State:
-        """Both networks."""
-        return {"actor": self.actor.state_dict(), "critic": self.critic.state_dict(), "standard": self.standard.state_dict()}
+        """Networks and statistics; the generator belongs to its owner."""
+        return checkpoint.save_parts(self._parts())
 
     def load_state_dict(self, state: State) -> None:
         """Continue from `state_dict`."""
-        self.actor.load_state_dict(state["actor"])
-        self.critic.load_state_dict(state["critic"])
-        self.standard.load_state_dict(state["standard"])
+        checkpoint.load_parts(state, self._parts())
 
 
 def worth(critic: nn.Module, obs: Obs, assignment: Tensor) -> Tensor:

@@ -14,16 +14,17 @@ from pydantic import Field
 from torch import Generator, Tensor
 from torch.nn.functional import mse_loss, one_hot
 
+from rhmc import checkpoint
 from rhmc.filters import FILTERS
-from rhmc.learner import Learner, pack_step, taken, unpack
+from rhmc.learner import Learner, Learners, pack_step, taken, unpack
 from rhmc.nets import ENCODERS, Sizes, append, team
 from rhmc.sampling import gumbel, mix, straight_through
-from rhmc.settings import Scaled, Slow
-from rhmc.standardise import Standard
+from rhmc.settings import Slow
+from rhmc.standardise import Scale, Standard
 from rhmc.types import Batch, Obs, Spec, State, Transition, assigned_reward
 
 
-class Config(Slow, Scaled):
+class Config(Slow):
     """Settings of the low level; lr and gamma are the paper's."""
 
     filter: Literal["on", "off"] = Field("on", description="hide unassigned targets from the executors (Eq. 10)")
@@ -36,6 +37,7 @@ class Config(Slow, Scaled):
         "local", description="what the executors are paid: their scores on assigned targets, or the team's reward"
     )
     gamma_l: float = Field(0.99, ge=0, le=1)
+    standardise_l: Scale = Field("none", description="as `standardise` of other methods, for the executors")
     epsilon: float = Field(0.05, ge=0, le=1, description="share of actions drawn at random while exploring")
     logit_penalty: float = Field(1e-3, ge=0, description="weight of the squared logits (as in MADDPG)")
     batch: int = Field(256, ge=1, description="rows of an update")
@@ -55,7 +57,7 @@ class Executor:
         actor, critic = (team(make, spec.agents, share=cfg.share).to(rng.device) for make in (local, central))
         self.actor = Learner(actor, lr=cfg.lr, polyak=cfg.polyak, clip=cfg.grad_clip)
         self.critic = Learner(critic, lr=cfg.lr, polyak=cfg.polyak, clip=cfg.grad_clip)
-        self.standard = Standard(cfg.standardise, rng.device)
+        self.standard = Standard(cfg.standardise_l, rng.device)
 
     def act(self, obs: Obs, assignment: Tensor, rng: Generator, *, explore: bool) -> Tensor:
         """Actions (B, N) int64: sampled from the softened policy, or its greatest logit."""
@@ -95,15 +97,20 @@ class Executor:
     def _one_hot(self, action: Tensor) -> Tensor:
         return one_hot(action, self.actions).float()
 
+    def learners(self) -> Learners:
+        """Actor and critic."""
+        return [self.actor, self.critic]
+
+    def _parts(self) -> checkpoint.Parts:
+        return {"actor": self.actor, "critic": self.critic, "standard": self.standard}
+
     def state_dict(self) -> State:
-        """Both networks."""
-        return {"actor": self.actor.state_dict(), "critic": self.critic.state_dict(), "standard": self.standard.state_dict()}
+        """Networks and statistics; the generator belongs to its owner."""
+        return checkpoint.save_parts(self._parts())
 
     def load_state_dict(self, state: State) -> None:
         """Continue from `state_dict`."""
-        self.actor.load_state_dict(state["actor"])
-        self.critic.load_state_dict(state["critic"])
-        self.standard.load_state_dict(state["standard"])
+        checkpoint.load_parts(state, self._parts())
 
 
 def told(obs: Obs, assignment: Tensor) -> Obs:

@@ -1,7 +1,7 @@
 """What every learner shares: a replay of rows, and a network with its slow copy and optimiser."""
 
 from copy import deepcopy
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Generator, Tensor, nn
@@ -68,7 +68,13 @@ class Learner(Generic[Net]):
         self.polyak, self.clip = polyak, clip
         self.params: list[Tensor] = list(net.parameters())
         self.slow_params: list[Tensor] = list(self.slow.parameters())
+        self.lr = lr
         self.optimiser = torch.optim.Adam(self.params, lr=lr, fused=True)
+
+    def anneal(self, left: float) -> None:
+        """From now on, steps of `left` times the size given at the start."""
+        for group in self.optimiser.param_groups:
+            group["lr"] = self.lr * left
 
     def update(self, loss: Tensor) -> Tensor:
         """One step down `loss`; returns the norm of the gradient. Other networks in the loss are left alone."""
@@ -95,6 +101,9 @@ class Learner(Generic[Net]):
         self.net.load_state_dict(state["net"])
         self.slow.load_state_dict(state["slow"])
         self.optimiser.load_state_dict(state["optimiser"])
+
+
+Learners = list[Learner[Any]]
 
 
 def pack(obs: Obs, prefix: str = "") -> Batch:

@@ -9,8 +9,9 @@ import torch
 from torch import Generator, Tensor, nn
 from torch.nn.functional import mse_loss
 
+from rhmc import checkpoint
 from rhmc.executor import PAID, Config, seen, told
-from rhmc.learner import Learner, pack_step, taken, unpack
+from rhmc.learner import Learner, Learners, pack_step, taken, unpack
 from rhmc.nets import ENCODERS, Sizes, team
 from rhmc.standardise import Standard
 from rhmc.types import Batch, Obs, Spec, State, Transition
@@ -42,7 +43,7 @@ class MixedExecutor:
     def __init__(self, cfg: Config, spec: Spec, rng: Generator) -> None:
         self.cfg, self.actions, self.paid = cfg, spec.actions, PAID[cfg.low_reward]
         self.q = Learner(Values(cfg, spec).to(rng.device), lr=cfg.lr, polyak=cfg.polyak, clip=cfg.grad_clip)
-        self.standard = Standard(cfg.standardise, rng.device)
+        self.standard = Standard(cfg.standardise_l, rng.device)
 
     def act(self, obs: Obs, assignment: Tensor, rng: Generator, *, explore: bool) -> Tensor:
         """Actions (B, N) int64: the greatest value, or epsilon-greedy."""
@@ -72,11 +73,17 @@ class MixedExecutor:
         self.q.update(td)
         return {"low_td": td, "low_q": q.mean(), "low_reward": rows["reward"].mean()}
 
+    def learners(self) -> Learners:
+        """The values."""
+        return [self.q]
+
+    def _parts(self) -> checkpoint.Parts:
+        return {"q": self.q, "standard": self.standard}
+
     def state_dict(self) -> State:
-        """Networks and statistics."""
-        return {"q": self.q.state_dict(), "standard": self.standard.state_dict()}
+        """Networks and statistics; the generator belongs to its owner."""
+        return checkpoint.save_parts(self._parts())
 
     def load_state_dict(self, state: State) -> None:
         """Continue from `state_dict`."""
-        self.q.load_state_dict(state["q"])
-        self.standard.load_state_dict(state["standard"])
+        checkpoint.load_parts(state, self._parts())

@@ -16,7 +16,7 @@ from torch.nn.functional import huber_loss
 
 from rhmc import checkpoint
 from rhmc.experience import Rollout, flat, minibatches, values
-from rhmc.learner import Learner, taken, unpack
+from rhmc.learner import Learner, Learners, taken, unpack
 from rhmc.nets import ENCODERS, Sizes, team
 from rhmc.returns import gae
 from rhmc.sampling import gumbel
@@ -192,9 +192,13 @@ class PPO:
         """What the critic puts out for each agent, in the scale of its targets: (B, N)."""
         return self.critic.net(obs).squeeze(-1)
 
+    def learners(self) -> Learners:
+        """Actor and critic."""
+        return [self.actor, self.critic]
+
     # Checkpoints
 
-    def _parts(self) -> dict[str, checkpoint.Part]:
+    def _parts(self) -> checkpoint.Parts:
         learners = {"actor": self.actor, "critic": self.critic}
         return learners | {"rollout": self.rollout, "standard": self.standard, "objective": self.objective}
 

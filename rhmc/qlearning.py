@@ -12,7 +12,7 @@ from torch.nn.functional import mse_loss
 
 from rhmc import checkpoint
 from rhmc.experience import Experience
-from rhmc.learner import Learner, pack_step, taken, unpack
+from rhmc.learner import Learner, Learners, pack_step, taken, unpack
 from rhmc.nets import ENCODERS, Sizes, team
 from rhmc.schedules import linear
 from rhmc.settings import OffPolicy, Slow, Standardised
@@ -98,9 +98,13 @@ class QLearning:
         loss = mse_loss(chosen, self.standard.target(target).expand_as(chosen))
         return loss, {"td_loss": loss, "q": chosen.mean()}
 
+    def learners(self) -> Learners:
+        """The values."""
+        return [self.q]
+
     # Checkpoints
 
-    def _parts(self) -> dict[str, checkpoint.Part]:
+    def _parts(self) -> checkpoint.Parts:
         return {"q": self.q, "experience": self.experience, "standard": self.standard}
 
     def state_dict(self) -> State:

@@ -1,10 +1,9 @@
 """Settings that several methods have, under one name and one meaning each."""
 
-from typing import Literal
-
 from pydantic import Field
 
 from rhmc.nets import EncoderName
+from rhmc.standardise import Scale
 from rhmc.types import Frozen
 
 
@@ -24,18 +23,13 @@ class Slow(Networks):
     polyak: float = Field(0.995, ge=0, le=1, description="share of the slow copies kept per update")
 
 
-class Scaled(Frozen):
-    """For whatever learns from rewards."""
-
-    standardise: Literal["none", "reward", "return"] = Field(
-        "reward", description="learn from rewards, or predict returns, of mean 0 and deviation 1 (`rhmc.standardise`)"
-    )
-
-
-class Standardised(Scaled):
+class Standardised(Frozen):
     """For methods that learn from one reward and one discount."""
 
     gamma: float = Field(0.99, ge=0, le=1)
+    standardise: Scale = Field(
+        "reward", description="learn from rewards, or predict returns, of mean 0 and deviation 1 (`rhmc.standardise`)"
+    )
 
 
 class OffPolicy(Frozen):

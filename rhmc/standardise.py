@@ -12,6 +12,7 @@ from torch import Tensor
 
 from rhmc.types import State
 
+Scale = Literal["none", "reward", "return"]
 KEPT = 0.999  # share of the statistics kept per batch seen
 LEAST = 1e-2  # smallest deviation
 
@@ -24,7 +25,7 @@ class Standard:
         device: where the statistics live.
     """
 
-    def __init__(self, mode: Literal["none", "reward", "return"], device: torch.device) -> None:
+    def __init__(self, mode: Scale, device: torch.device) -> None:
         self.mode = mode
         self.sums = torch.zeros(3, device=device)  # of weights, values and squares
 

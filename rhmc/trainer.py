@@ -9,6 +9,7 @@ from torch import Tensor
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import EnvConfig, make_env
 from rhmc.evaluate import evaluate
+from rhmc.schedules import linear
 from rhmc.types import Batch, Frozen, Metrics, State, Transition
 
 
@@ -19,6 +20,12 @@ class Config(Frozen):
     num_envs: int = Field(128, ge=1, description="parallel copies; part of a run's identity, trajectories depend on it")
     time_limit: Literal["bootstrap", "terminal"] = Field(
         "bootstrap", description="what the time limit is to every method: a cut that bootstraps, or an end"
+    )
+    anneal: float = Field(
+        1.0,
+        ge=0,
+        le=1,
+        description="share of every step size that is left at the end of the budget (linear)",
     )
     evaluations: int = Field(100, ge=1, description="points of the curve after the one at step 0")
     eval_episodes: int = Field(100, ge=1)
@@ -84,6 +91,9 @@ class Trainer:
         means = Means()
         while self.step < until:
             means.add({"reward": self._act()})
+            left = linear(1.0, self.cfg.anneal, self.cfg.steps, self.step)
+            for learner in self.algorithm.learners():
+                learner.anneal(left)
             means.add(self.algorithm.update())
             self.step += self.cfg.num_envs
         return {f"train/{key}": value for key, value in means.result().items()}

@@ -7,12 +7,13 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch import Generator, Tensor
+from torch import Generator, Tensor, nn
 
 from rhmc.algorithms import ALGORITHMS
 from rhmc.algorithms import rhmc as rhmc_page
 from rhmc.algorithms.base import Method
 from rhmc.envs import ENVS
+from rhmc.learner import Learner, Learners
 from rhmc.trainer import Config, Means, Trainer, grid_step
 from rhmc.types import Frozen, Metrics, Obs, Spec, Transition
 from tests import toy
@@ -31,6 +32,7 @@ class Recorder:
     def __init__(self, cfg: Any, spec: Spec, num_envs: int, rng: Generator) -> None:
         self.spec, self.num_envs, self.rng = spec, num_envs, rng
         self.weight = torch.rand(3)
+        self.learner = Learner(nn.Linear(1, 1), lr=0.5)
         self.seen: list[Transition] = []
         self.options: list[Tensor] = []
         self.acted: list[tuple[Obs, bool]] = []
@@ -52,6 +54,9 @@ class Recorder:
 
     def update(self) -> dict[str, Tensor]:
         return {"seen": torch.tensor(float(len(self.seen)))} if len(self.seen) % 2 else {}
+
+    def learners(self) -> Learners:
+        return [self.learner]
 
     def state_dict(self) -> dict[str, Any]:
         return {"rng": self.rng.get_state()}
@@ -237,3 +242,19 @@ def test_means() -> None:
     assert means.result() == {"x": 1.5, "y": 5.0}
     assert not means.sums["y"].requires_grad
     assert Means().result() == {}
+
+
+@pytest.mark.parametrize("left", [1.0, 0.2, 0.0])
+def test_step_sizes_fall_in_a_line_to_what_is_left_of_them(left: float) -> None:
+    """Budget of 60 in steps of 4: the update after k steps has 1 - (1 - left) k / 60 of the size."""
+    run = trainer(anneal=left)
+    sizes: list[float] = []
+    learner, update = run.algorithm.learners()[0], run.algorithm.update
+
+    def recorded() -> dict[str, Tensor]:
+        sizes.append(learner.optimiser.param_groups[0]["lr"])
+        return update()
+
+    run.algorithm.update = recorded  # type: ignore[method-assign]
+    list(run)
+    assert sizes == pytest.approx([0.5 * (1 - (1 - left) * step / 60) for step in range(0, 60, ENVIRONMENTS)])

@@ -5,6 +5,7 @@ from typing import Any, Literal, NamedTuple, Protocol
 
 from torch import Generator, Tensor
 
+from rhmc.learner import Learners
 from rhmc.types import Batch, Carry, Obs, State, Transition
 
 
@@ -52,6 +53,10 @@ class Algorithm(Protocol):
 
     def update(self) -> Batch:
         """Learn what is due after the last `observe`: scalar tensors to log, or nothing."""
+        ...
+
+    def learners(self) -> Learners:
+        """Every network that learns, with its optimiser: the trainer anneals their step sizes."""
         ...
 
     def state_dict(self) -> State:

@@ -21,7 +21,7 @@ from torch.nn.functional import mse_loss, one_hot
 from rhmc import checkpoint
 from rhmc.algorithms.base import About
 from rhmc.experience import Rollout, ends, flat, minibatches
-from rhmc.learner import Learner, taken, unpack
+from rhmc.learner import Learner, Learners, taken, unpack
 from rhmc.nets import ENCODERS, Sizes, team
 from rhmc.returns import td_lambda
 from rhmc.sampling import mix
@@ -158,9 +158,13 @@ class COMA:
         gain = (rows["advantage"] * -taken(surprise, rows["action"])).mean()
         return -gain - self.cfg.entropy * entropy, {"entropy": entropy, "gain": gain}
 
+    def learners(self) -> Learners:
+        """Actor and critic."""
+        return [self.actor, self.critic]
+
     # Checkpoints
 
-    def _parts(self) -> dict[str, checkpoint.Part]:
+    def _parts(self) -> checkpoint.Parts:
         return {"actor": self.actor, "critic": self.critic, "rollout": self.rollout, "standard": self.standard}
 
     def state_dict(self) -> State:

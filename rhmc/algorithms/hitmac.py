@@ -20,7 +20,7 @@ from torch import Generator, Tensor
 from rhmc import attention, checkpoint, executor
 from rhmc.algorithms.base import About
 from rhmc.experience import Experience
-from rhmc.learner import Replay, choose, pack
+from rhmc.learner import Learners, Replay, choose, pack
 from rhmc.settings import OffPolicy
 from rhmc.types import Batch, Carry, Obs, Spec, State, Transition
 
@@ -111,10 +111,14 @@ class HiTMAC:
             logs |= self.coordinator.learn(rollout) if rollout else {}
         return logs
 
+    def learners(self) -> Learners:
+        """Those of both levels."""
+        return [*self.coordinator.learners(), *self.executor.learners()]
+
     # Checkpoints
 
-    def _parts(self) -> dict[str, checkpoint.Part]:
-        levels: dict[str, checkpoint.Part] = {"coordinator": self.coordinator, "executor": self.executor}
+    def _parts(self) -> checkpoint.Parts:
+        levels: checkpoint.Parts = {"coordinator": self.coordinator, "executor": self.executor}
         return levels | {"practised": self.practised, "decisions": self.decisions}
 
     def state_dict(self) -> State:

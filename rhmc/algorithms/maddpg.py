@@ -21,7 +21,7 @@ from rhmc import checkpoint
 from rhmc.algorithms.base import About
 from rhmc.experience import Experience
 from rhmc.heads import Continuous, Discrete, Head
-from rhmc.learner import Learner, pack_step, unpack
+from rhmc.learner import Learner, Learners, pack_step, unpack
 from rhmc.nets import ENCODERS, Sizes, team
 from rhmc.settings import OffPolicy, Slow, Standardised
 from rhmc.standardise import Standard
@@ -116,9 +116,13 @@ class MADDPG:
         gain = self.critic.net(obs, own=self.head.policy(output, self.rng), joint=taken).mean()
         return self.cfg.penalty * output.square().mean() - gain, {"output": output.abs().mean()}
 
+    def learners(self) -> Learners:
+        """Actor and critic."""
+        return [self.actor, self.critic]
+
     # Checkpoints
 
-    def _parts(self) -> dict[str, checkpoint.Part]:
+    def _parts(self) -> checkpoint.Parts:
         parts = {"actor": self.actor, "critic": self.critic}
         return parts | {"experience": self.experience, "standard": self.standard}
 

@@ -16,7 +16,7 @@ from torch import Generator, Tensor
 from rhmc import checkpoint, coordinator, executor, mixed
 from rhmc.algorithms.base import About
 from rhmc.experience import Experience
-from rhmc.learner import Replay, choose, pack
+from rhmc.learner import Learners, Replay, choose, pack
 from rhmc.regulation import REGULATORS, executed
 from rhmc.settings import OffPolicy
 from rhmc.types import Batch, Carry, Obs, Spec, State, Transition
@@ -120,10 +120,14 @@ class RHMC:
                 logs |= self.coordinator.update(self.high.sample(self.cfg.batch_h))
         return logs
 
+    def learners(self) -> Learners:
+        """Those of both levels."""
+        return [*self.coordinator.learners(), *self.executor.learners()]
+
     # Checkpoints
 
-    def _parts(self) -> dict[str, checkpoint.Part]:
-        levels: dict[str, checkpoint.Part] = {"coordinator": self.coordinator, "executor": self.executor}
+    def _parts(self) -> checkpoint.Parts:
+        levels: checkpoint.Parts = {"coordinator": self.coordinator, "executor": self.executor}
         return levels | {"low": self.low, "high": self.high}
 
     def state_dict(self) -> State:

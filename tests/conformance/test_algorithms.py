@@ -47,6 +47,9 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {  # beside the defaults, on b
         "rhmc",
         {"regulator": "exact", "horizon": 2, "coordinator": "counterfactual", "executor": "expected"},
     ),
+    "rhmc mixed": ("rhmc", {"executor": "mixed", "low_reward": "team"}),
+    "rhmc mixed, scaled": ("rhmc", {"executor": "mixed", "standardise_l": "reward", "standardise_h": "return"}),
+    "rhmc scaled": ("rhmc", {"standardise_l": "return", "standardise_h": "reward"}),
     "rhmc period 3": ("rhmc", {"assignment_period": 3}),
     "rhmc period 3 counterfactual": (
         "rhmc",
