@@ -16,6 +16,7 @@ from rhmc.executor import Executor
 from rhmc.learner import Learner, pack
 from rhmc.nets import ENCODERS, PairNet, Sizes, append
 from rhmc.regulation import REGULATORS
+from rhmc.standardise import KEPT
 from rhmc.types import Batch, Obs, Spec, Transition, assigned_reward
 from tests.oracles import regulation as oracle
 
@@ -205,6 +206,57 @@ def test_coordinator_target_by_hand(gradient: str, encoder: str, terminal: bool)
     logs = high.update(rows(terminal=terminal, reward=torch.tensor([0.75]), earned=torch.tensor([0.0])))
     target = 0.75 if terminal else 0.75 + 0.25 * N * M * 2
     assert logs["high_td"].item() == pytest.approx((N * M * 0.5 - target) ** 2)
+
+
+def test_coordinator_standardises_rewards_or_returns_by_those_seen() -> None:
+    """Rewards of mean 2 and deviation 1; returns of mean 6 and deviation 2, the next one put out as 12 of them."""
+    for scale, target in (("reward", (0.75 - 2) + 0.25 * 12), ("return", (0.75 + 0.25 * (12 * 2 + 6) - 6) / 2)):
+        high = Coordinator(config(encoder="mlp", standardise_h=scale), SPEC, seeded())
+        constant(high.critic.net, [0.5])
+        constant(high.critic.slow, [2.0])
+        high.standard.see_rewards(torch.tensor([1.0, 3.0]))
+        high.standard.see_returns(torch.tensor([4.0, 8.0]))
+        high.standard.see_returns = lambda value: None  # type: ignore[method-assign]
+        logs = high.update(rows(reward=torch.tensor([0.75]), earned=torch.tensor([0.0])))
+        assert logs["high_td"].item() == pytest.approx((N * M * 0.5 - target) ** 2, rel=1e-4), scale
+
+
+def test_executor_standardises_rewards_or_returns_by_those_seen() -> None:
+    """As above; the slow critic puts out 20 for the action that the slow actor chooses."""
+    for scale, target in (("reward", (0.5 - 2) + 0.5 * 20), ("return", (0.5 + 0.5 * (20 * 2 + 6) - 6) / 2)):
+        low = Executor(config(encoder="mlp", standardise_l=scale), SPEC, seeded())
+        constant(low.critic.net, [1.0, 2.0, 4.0])
+        constant(low.critic.slow, [10.0, 20.0, 40.0])
+        constant(low.actor.slow, [0.0, 3.0, 1.0])
+        low.standard.see_rewards(torch.tensor([1.0, 3.0]))
+        low.standard.see_returns(torch.tensor([4.0, 8.0]))
+        low.standard.see_returns = lambda value: None  # type: ignore[method-assign]
+        pay, action = torch.full((1, N), 0.5), torch.full((1, N), 2)
+        assert low.update(rows(reward=pay, action=action))["low_td"].item() == pytest.approx(
+            (4 - target) ** 2, rel=1e-4
+        )
+
+
+def test_each_level_counts_its_own_rewards() -> None:
+    """The coordinator what it is paid for ended periods, the executors theirs at every step."""
+    cfg = config(standardise_l="reward", standardise_h="reward", assignment_period=2, regulator="none", warmup=10**6)
+    env = make_env(coverage.Config(agents=N, targets=M), 5, seeded(1))
+    algo = RHMC(cfg, env.spec, 5, seeded())
+    obs, carry = env.reset(), algo.carry(5)
+    for _ in range(4):
+        action, carry, extra = algo.act(obs, carry, seeded(2), explore=True)
+        options, s = env.options(), env.step(action, extra["assignment"])
+        t = Transition(
+            obs, action, s.reward, s.local, s.completed, s.terminal, s.truncated, s.final_obs, options, extra
+        )
+        algo.observe(t)
+        obs = s.obs
+    assert algo.high.size == 2 * 5
+    for name, level, kept in (("low", algo.executor, algo.low.replay), ("high", algo.coordinator, algo.high)):
+        weight, total, _ = level.standard.sums
+        found = kept.rows["reward"][: kept.size].mean().item()
+        assert (total / weight).item() == pytest.approx(found, abs=2e-3), name
+        assert weight.item() == pytest.approx(1 - KEPT ** (4 if name == "low" else 2), rel=1e-3)
 
 
 class Taught(PairNet):

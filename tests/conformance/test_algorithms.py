@@ -47,8 +47,11 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {  # beside the defaults, on b
         "rhmc",
         {"regulator": "exact", "horizon": 2, "coordinator": "counterfactual", "executor": "expected"},
     ),
-    "rhmc mixed": ("rhmc", {"executor": "mixed", "low_reward": "team"}),
-    "rhmc mixed, scaled": ("rhmc", {"executor": "mixed", "standardise_l": "reward", "standardise_h": "return"}),
+    "rhmc mixed": ("rhmc", {"executor": "mixed", "low_reward": "team", "epsilon": 0.5}),
+    "rhmc mixed, scaled": (
+        "rhmc",
+        {"executor": "mixed", "epsilon": 0.5, "standardise_l": "reward", "standardise_h": "return"},
+    ),
     "rhmc scaled": ("rhmc", {"standardise_l": "return", "standardise_h": "reward"}),
     "rhmc period 3": ("rhmc", {"assignment_period": 3}),
     "rhmc period 3 counterfactual": (
@@ -209,6 +212,13 @@ def parts(thing: Any) -> dict[str, Any]:
     """What hangs on an object of the project, its settings aside."""
     ours = type(thing).__module__.startswith("rhmc") and hasattr(thing, "__dict__")
     return {key: value for key, value in vars(thing).items() if key != "cfg"} if ours else {}
+
+
+@every
+def test_a_method_names_every_network_that_learns(case: Case) -> None:
+    algo = build(case.algo, world(case.env, batch=4)[0])
+    assert {id(one) for one in algo.learners()} == {id(one) for one in learners(algo)}
+    assert algo.learners()
 
 
 def test_a_run_without_a_step_continues_too() -> None:
@@ -691,6 +701,21 @@ def test_every_method_learns_the_tiny_task(kind: str, encoder: str) -> None:
 @pytest.mark.parametrize(("kind", "scale"), [name.split() for name in SCALED])
 def test_every_method_learns_with_every_standardisation(kind: str, scale: str) -> None:
     assert_learned(returns(kind, encoder="pairwise", standardise=scale))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"executor": "mixed", "low_reward": "team"},
+        {"executor": "mixed", "standardise_l": "reward", "standardise_h": "reward"},
+        {"executor": "mixed", "low_reward": "team", "high_reward": "team", "regulator": "none", "filter": "off"},
+        {"standardise_l": "reward", "standardise_h": "return"},
+        {"standardise_l": "return"},
+    ],
+    ids=str,
+)
+def test_rhmc_learns_in_its_variants(changes: dict[str, Any]) -> None:
+    assert_learned(returns("rhmc", encoder="pairwise", **changes))
 
 
 @pytest.mark.parametrize("encoder", ["mlp", "pairwise"])
