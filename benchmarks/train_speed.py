@@ -1,5 +1,7 @@
 """Training steps per CPU second of every method at its default settings, one torch thread. Prints Markdown.
 
+Beside them, in the same run, `mpe2`'s simple_spread_v3 with three agents and nothing that learns.
+
 `--study FILE` measures the arms of a study instead.
 
 A step is one environment step of one of the parallel copies; acting, storing and learning are timed, evaluation is not:
@@ -13,7 +15,7 @@ import pstats
 import time
 from pathlib import Path
 
-from env_speed import machine
+import env_speed
 from torch.profiler import ProfilerActivity, profile
 
 import rhmc
@@ -25,6 +27,7 @@ from rhmc.trainer import Config, Trainer
 SETTINGS = (("paper", "mlp"), ("extended", "pairwise"))  # observation, encoder
 TASKS = ("coverage", "navigation")
 PACKAGE = Path(rhmc.__file__).parent
+PEER_SECONDS = 2.0  # of each of three spans
 TOP = 15  # rows of a profile
 
 
@@ -112,14 +115,16 @@ def main() -> None:
     parser.add_argument("--profile", action="store_true", help="show where the time goes, with both settings of each")
     args = parser.parse_args()
     cases = [(t, o, e, k) for t in args.tasks for k in args.algorithms for o, e in SETTINGS]
-    print(f"{machine()} Training steps per CPU second, {args.steps:,} steps after as many for warm-up.\n")
+    print(f"{env_speed.machine()} Training steps per CPU second, {args.steps:,} steps after as many for warm-up.\n")
     if args.study:
         study_table(args.study, args.steps, args.profile)
         return
-    print("| task | method | observation | encoder | steps/s |\n|---|---|---|---|---:|")
+    alone = env_speed.rate(env_speed.peer(3), PEER_SECONDS)
+    print("| task | method | observation | encoder | steps/s | times mpe2 alone |\n|---|---|---|---|---:|---:|")
+    print(f"| {env_speed.PEER} | none | | | {alone:,.0f} | 1.0 |", flush=True)
     for name, observation, encoder, kind in cases:
         speed = rate(trainer(name, observation, encoder, kind, args.steps))
-        print(f"| {name} | {kind} | {observation} | {encoder} | {speed:,.0f} |", flush=True)
+        print(f"| {name} | {kind} | {observation} | {encoder} | {speed:,.0f} | {speed / alone:.1f} |", flush=True)
     for name, observation, encoder, kind in cases if args.profile else ():
         run = trainer(name, observation, encoder, kind, args.steps // 4)
         next(run), next(run)
