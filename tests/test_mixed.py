@@ -12,6 +12,7 @@ from rhmc.envs import coverage, make_env
 from rhmc.learner import pack
 from rhmc.mixed import MixedExecutor
 from rhmc.types import Batch, Obs, Spec, Transition
+from tests.doubles import Known
 
 SPEC = Spec(2, 3, agent_features=1, pair_features=4, peer_features=0, actions=3, continuous=False, episode=9)
 N, M = SPEC.agents, SPEC.targets
@@ -37,17 +38,6 @@ def rows(batch: int = 1, **changes: Tensor) -> Batch:
     some = pack(obs[0]) | pack(obs[1], "next_") | {"terminal": torch.zeros(batch, dtype=torch.bool)}
     held = (torch.rand(batch, N, M) < 0.5).float()
     return some | {"assignment": held, "action": torch.zeros(batch, N, dtype=torch.int64)} | changes
-
-
-class Known(nn.Module):
-    """Values by agent and action, whatever is seen."""
-
-    def __init__(self, values: list[list[float]]) -> None:
-        super().__init__()
-        self.values = nn.Parameter(torch.tensor(values))
-
-    def forward(self, obs: Obs) -> Tensor:
-        return self.values.expand(len(obs.pairs), -1, -1)
 
 
 class Doubling(nn.Module):

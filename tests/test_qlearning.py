@@ -15,6 +15,7 @@ from rhmc.nets import ENCODERS, Sizes, Unshared, mix, team
 from rhmc.qlearning import QLearning
 from rhmc.schedules import linear
 from rhmc.types import Batch, Obs, Spec
+from tests.doubles import Known
 
 SPEC = Spec(2, 3, agent_features=1, pair_features=4, peer_features=2, actions=3, continuous=False, episode=9)
 SIZES = Sizes.of(SPEC)
@@ -41,17 +42,6 @@ def rows(reward: list[float], terminal: list[bool], action: list[list[int]]) -> 
     count = len(reward)
     known = {"reward": torch.tensor(reward), "terminal": torch.tensor(terminal), "action": torch.tensor(action)}
     return known | pack(observation(count)) | pack(observation(count), "next_")
-
-
-class Known(nn.Module):
-    """Action values (B, N, 3) that are the same everywhere, so that what is learned from them can be worked out."""
-
-    def __init__(self, values: list[list[float]]) -> None:
-        super().__init__()
-        self.values = nn.Parameter(torch.tensor(values))
-
-    def forward(self, obs: Obs) -> Tensor:
-        return self.values.expand(len(obs.pairs), -1, -1)
 
 
 NET = [[0.0, 1.0, 2.0], [3.0, 0.5, 0.0]]  # chooses actions 2 and 0
