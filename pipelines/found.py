@@ -59,7 +59,7 @@ def _provenance(search: Search, arm: str, best: Best, counts: dict[str, int], fi
         "task": {"kind": env.kind} | env.model_dump(mode="json", exclude_defaults=True),
         "trainer": search.arms[arm].setting.trainer.model_dump(mode="json"),
         "best": {
-            "trial": best.origin,
+            "trial": best.place,
             "found": dict(best.params),
             "objective": f"mean of {OBJECTIVE} over the seeds",
             "value": best.value,

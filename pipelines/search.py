@@ -64,13 +64,13 @@ class Dimension(Frozen):
         if self.low is None or self.high is None:
             raise ValueError("must have 'low' and 'high', or 'choices'")
         if self.low >= self.high:
-            raise ValueError(f"high: {show(self.high)} is not allowed; must be above low")
+            raise ValueError(f"high: {self.high:g} is not allowed; must be above low")
         if self.log and self.low <= 0:
-            raise ValueError(f"low: {show(self.low)} is not allowed; must be above 0 where log is true")
+            raise ValueError(f"low: {self.low:g} is not allowed; must be above 0 where log is true")
         if self.log and self.step is not None:
             raise ValueError("step: not allowed where log is true")
         if self.step is not None and abs((steps := (self.high - self.low) / self.step) - round(steps)) > 1e-9:
-            raise ValueError(f"high: {show(self.high)} is not allowed; must be low and a whole number of steps")
+            raise ValueError(f"high: {self.high:g} is not allowed; must be low and a whole number of steps")
         return self
 
     def _a_list(self) -> Self:

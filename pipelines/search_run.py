@@ -26,7 +26,7 @@ from pipelines.run import BAD, DONE, FAILED, INTERRUPTED, interrupt_to, set_up_r
 from pipelines.search import Search
 from pipelines.store import Checkpoints, Home, StoreError
 from pipelines.tracker import Card, RunLog, Status, StudyCard, Tracker
-from pipelines.trials import OBJECTIVE, Asked, Ledger, explained, open_storage, stale, storage_url
+from pipelines.trials import OBJECTIVE, Asked, Ledger, explained, look, open_storage, storage_url
 from rhmc.types import Metrics
 
 if TYPE_CHECKING:
@@ -201,22 +201,34 @@ class Drive:
             self.book.fail(key, one.asked, result.error, result.trace)
             one.ledger.fail(one.asked, result.error)
             return
-        points, first = result["points"], one.points
-        one.points += len(points)
-        self.book.points(key, one.asked, points)
-        if result["stopped"]:
-            self._end(key)
-            self.book.interrupt(key, one.asked)
-        elif why := one.ledger.report(one.asked, points, first, done=result["done"]):
+        why = self._points(key, one, result["points"])
+        if why:
             self._end(key)
             self.book.prune(key, one.asked, why)
             one.ledger.prune(one.asked, why)
             Checkpoints(one.folder).clear()
+        elif result["stopped"]:
+            self._end(key)
+            self.book.interrupt(key, one.asked)
         elif result["done"]:
             self._end(key)
-            self._complete(key, one, points[-1])
+            self._complete(key, one, result["points"][-1])
         else:
             self.pool.go_on(key)
+
+    def _points(self, key: str, one: Running, points: Sequence[Metrics]) -> str:
+        """Take in points one by one, so that a trial that continues with many is given up where it would have been.
+
+        Returns:
+            Why the trial should be given up; nothing if it should not.
+        """
+        for point in points:
+            why = one.ledger.report(one.asked, point, one.points)
+            self.book.points(key, one.asked, [point])
+            one.points += 1
+            if why:
+                return why
+        return ""
 
     def _complete(self, key: str, one: Running, last: Metrics) -> None:
         returns = [last[f"seeds/{seed}"] for seed in self.search.seed_list()]
@@ -251,13 +263,13 @@ class Book:
         """A trial begins or continues; returns its key, which names it in the log and in the checkpoints."""
         card = trial_card(self.search, asked, self.code, self.commit)
         log = self.logs[card.key] = self.tracker.start(card)
-        log.tag("trial", str(asked.origin))
+        log.tag("trial", str(asked.place))
         log.text("config.yaml", self._yaml(asked, card))
         self.board.start(self._name(asked), self.search.steps)
         return card.key
 
     def _yaml(self, asked: Asked, card: Card) -> str:
-        head = {"search": self.search.name, "profile": self.search.profile, "arm": asked.arm, "trial": asked.origin}
+        head = {"search": self.search.name, "profile": self.search.profile, "arm": asked.arm, "trial": asked.place}
         names = {"fingerprint": self.code, "commit": card.commit, "seeds": self.search.seed_list()}
         out = StringIO()
         YAML().dump(head | names | asked.setting.model_dump(mode="json"), out)
@@ -299,11 +311,11 @@ class Book:
 
 def trial_card(search: Search, asked: Asked, code: str, commit: str) -> Card:
     """A trial as its log shows it. Two trials with the same values are two runs."""
-    parts = (asked.setting.canonical(), str(search.seed_list()), str(asked.origin), search.identity(asked.arm, code))
+    parts = (asked.setting.canonical(), str(search.seed_list()), str(asked.place), search.identity(asked.arm, code))
     spec_id = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:12]
     kinds = asked.setting.algo.kind, asked.setting.env.kind
     params = {f"algo.{name}": str(value) for name, value in asked.params.items()}
-    return Card(asked.arm, search.seed_list()[0], spec_id, code, *kinds, commit, params, asked.origin)
+    return Card(asked.arm, search.seed_list()[0], spec_id, code, *kinds, commit, params, asked.place)
 
 
 def search_card(search: Search) -> StudyCard:
@@ -383,7 +395,7 @@ def _best_line(ledger: Ledger) -> str:
     if best is None:
         return f"{ledger.arm}: no trial is finished"
     values = ", ".join(f"{name}={_short(value)}" for name, value in best.params.items())
-    return f"{ledger.arm}: {OBJECTIVE} {best.value:.2f} over {len(best.returns)} seeds in trial {best.origin}: {values}"
+    return f"{ledger.arm}: {OBJECTIVE} {best.value:.2f} over {len(best.returns)} seeds in trial {best.place}: {values}"
 
 
 def _short(value: object) -> str:
@@ -403,11 +415,10 @@ def show_search(search: Search, home: Path) -> int:
             if storage is None:
                 print(f"{search.name} ({search.profile}): nothing has been tried yet")
                 return FAILED
-            ledgers = [Ledger(search, arm, code, storage) for arm in search.arms]
-            rows = [[*_row(one), str(stale(search, one.arm, code, storage))] for one in ledgers]
-            print_table(Console(), [*HEADER, "stale"], rows)
-            print("\n".join(_best_line(ledger) for ledger in ledgers))
-            return DONE if all(ledger.closed >= search.trials for ledger in ledgers) else FAILED
+            found = [look(search, arm, code, storage) for arm in search.arms]
+            print_table(Console(), [*HEADER, "stale"], [[*_row(ledger), str(stale)] for ledger, stale in found])
+            print("\n".join(_best_line(ledger) for ledger, _ in found))
+            return DONE if all(ledger.closed >= search.trials for ledger, _ in found) else FAILED
     except StoreError as error:
         print(f"rhmc: {error}", file=sys.stderr)
         return BAD

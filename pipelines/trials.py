@@ -1,10 +1,10 @@
 """The trials of a search in Optuna's database: asked for, told, taken up again. The only module that stores in Optuna.
 
 Each arm has a study of its own there, named by search, profile, arm and the identity of its settings and code. A trial
-has an `origin`, the number it was first asked under: one that was interrupted is closed as failed and its values are
-enqueued again under the same origin, so that it keeps its checkpoints and counts once.
+has a place in the budget. One that was interrupted is closed as failed and its values are enqueued again for the same
+place, so that it keeps its checkpoints and counts once.
 
-Every proposal has a sampler of its own, seeded by the search's seed and the trial's place in the budget. With one trial
+Every proposal has a sampler of its own, seeded by the search's seed and the place. With one trial
 at a time a search therefore gives the same proposals whether or not it was interrupted; with several, what a proposal
 knows of the others depends on which of them were faster.
 """
@@ -15,15 +15,15 @@ import os
 import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import optuna
 from filelock import FileLock
-from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
 from optuna.pruners import BasePruner, MedianPruner, NopPruner, SuccessiveHalvingPruner
 from optuna.samplers import BaseSampler, RandomSampler, TPESampler
-from optuna.storages import BaseStorage, RDBStorage
+from optuna.storages import BaseStorage, InMemoryStorage, RDBStorage
 from optuna.trial import FrozenTrial, TrialState
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import SQLAlchemyError
@@ -37,26 +37,27 @@ ATTEMPTS = 3  # launches that try a trial which raises
 CLOSED = (TrialState.COMPLETE, TrialState.PRUNED)
 OBJECTIVE = "final/return"  # what the report calls a run's final return; its mean over the seeds is maximised
 CURVE = "eval/return"  # what a trial is pruned by
+PLACE, ERROR = "place", "error"  # attributes of a trial
 
 
 class Asked(NamedTuple):
     """A trial to be trained."""
 
     arm: str
-    origin: int
+    place: int  # in the budget of its arm, from 0
     params: dict[str, Value]
     setting: Setting
 
     @property
     def name(self) -> str:
         """What a person calls it."""
-        return f"{self.arm} t{self.origin}"
+        return f"{self.arm} t{self.place}"
 
 
 class Best(NamedTuple):
     """The best finished trial of an arm."""
 
-    origin: int
+    place: int  # in the budget of its arm, from 0
     params: dict[str, Value]
     value: float
     returns: list[float]  # of each seed
@@ -82,28 +83,31 @@ class Ledger:
             pruner=make_pruner(search.pruner),
             load_if_exists=True,
         )
-        self.space = {name: distribution(one) for name, one in search.arms[arm].space.items()}
+        self.space = search.arms[arm].space
         self.live: dict[int, optuna.Trial] = {}
 
     def latest(self) -> dict[int, FrozenTrial]:
-        """By origin the trial that stands for it: the newest one. One that died before it had values is none."""
-        trials = self.study.get_trials(deepcopy=False)
-        return {origin(t): t for t in trials if t.state != TrialState.FAIL or t.params.keys() == self.space.keys()}
+        """By place in the budget the trial that stands for it: the newest one with all its values, or under way."""
+        standing = {}
+        for trial in self.study.get_trials(deepcopy=False):
+            place = place_of(trial)
+            if place is not None and (trial.state != TrialState.FAIL or self._whole(trial)):
+                standing[place] = trial
+        return standing
 
-    @property
-    def spent(self) -> int:
-        """Trials of the budget that are closed or under way."""
-        return sum(t.state != TrialState.WAITING for t in self.latest().values())
+    def _whole(self, trial: FrozenTrial) -> bool:
+        return values_of(trial).keys() == self.space.keys()
 
     @property
     def left(self) -> int:
         """Trials of the budget that are still to be asked for."""
-        return max(0, self.search.trials - self.spent)
+        spent = sum(trial.state != TrialState.WAITING for trial in self.latest().values())
+        return max(0, self.search.trials - spent)
 
     @property
     def closed(self) -> int:
         """Trials that gave a result, whole or pruned."""
-        return sum(t.state in CLOSED for t in self.latest().values())
+        return sum(trial.state in CLOSED for trial in self.latest().values())
 
     def take_up(self) -> int:
         """Close what a former launch left open and enqueue it again, and what failed fewer than `ATTEMPTS` times.
@@ -113,71 +117,72 @@ class Ledger:
         """
         latest, again = self.latest(), 0
         for trial in self.study.get_trials():
+            place = place_of(trial)
             if trial.state not in (TrialState.RUNNING, TrialState.FAIL):
                 continue
-            stands = latest.get(origin(trial), trial).number == trial.number
-            if stands and self._may_go_on(trial):
-                self.study.enqueue_trial(self._params(trial), user_attrs={"origin": origin(trial)})  # before it is
-                again += 1  # closed: whoever dies in between has it twice, and the newest stands for it
+            if place in latest and latest[place].number == trial.number and self._may_go_on(trial):
+                # Before it is closed: whoever dies in between has it twice, and the newest stands for both.
+                self.study.enqueue_trial(values_of(trial), user_attrs={PLACE: place})
+                again += 1
             if trial.state == TrialState.RUNNING:
                 self.study.tell(trial.number, state=TrialState.FAIL)
         return again
 
     def _may_go_on(self, trial: FrozenTrial) -> bool:
-        failures = [t for t in self.study.get_trials(deepcopy=False) if origin(t) == origin(trial) and error_of(t)]
-        return self._params(trial).keys() == self.space.keys() and len(failures) < ATTEMPTS
-
-    def _params(self, trial: FrozenTrial) -> dict[str, Any]:
-        return trial.params | trial.system_attrs.get("fixed_params", {})
+        same = [t for t in self.study.get_trials(deepcopy=False) if place_of(t) == place_of(trial)]
+        return self._whole(trial) and sum(ERROR in t.user_attrs for t in same) < ATTEMPTS
 
     def ask(self) -> Asked | None:
         """The next trial: one that was enqueued, or a new proposal. None, and pruned, where the method refuses it."""
-        self.study.sampler = make_sampler(self.search.sampler, self.spent)
-        trial = self.study.ask(self.space)
-        number = trial.user_attrs.get("origin", trial.number)
-        self.live[number] = trial
+        taken = self.latest()
+        place = next(number for number in count() if number not in taken)
+        self.study.sampler = make_sampler(self.search.sampler, place)
+        trial = self.study.ask()
+        if PLACE in trial.user_attrs:
+            place = int(trial.user_attrs[PLACE])
+        else:
+            trial.set_user_attr(PLACE, place)
+        self.live[place] = trial
+        params = {name: suggest(trial, name, one) for name, one in self.search.arms[self.arm].space.items()}
         try:
-            return Asked(self.arm, number, trial.params, self.search.arms[self.arm].at(trial.params))
+            return Asked(self.arm, place, params, self.search.arms[self.arm].at(params))
         except ValueError as error:
-            self._close(number, "pruned", f"refused: {one_line(error)}", TrialState.PRUNED)
+            self._close(place, "pruned", f"refused: {one_line(error)}", TrialState.PRUNED)
             return None
 
-    def report(self, trial: Asked, points: Sequence[Metrics], first: int, *, done: bool) -> str:
-        """Take in points of a trial's curve.
+    def report(self, trial: Asked, point: Metrics, number: int) -> str:
+        """Take in a point of a trial's curve.
 
         Args:
             trial: whose.
-            points: new ones, means over the seeds.
-            first: the number of the first of them; the point at step 0 has number 0.
-            done: they are the last.
+            point: means over the seeds.
+            number: of the point; the one at step 0 has number 0.
 
         Returns:
             Why the trial should be given up; nothing if it should not.
         """
-        live = self.live[trial.origin]
-        for number, point in enumerate(points, first):
-            if not math.isfinite(point[CURVE] + point.get(OBJECTIVE, 0.0)):
-                return f"no finite return at step {int(point['step'])}"
-            live.report(point[CURVE], number)
-        if done or first + len(points) <= self.search.pruner.warmup or not live.should_prune():
-            return ""
-        return f"behind the others at step {int(points[-1]['step'])}"
+        live, step = self.live[trial.place], int(point["step"])
+        if not math.isfinite(point[CURVE] + point.get(OBJECTIVE, 0.0)):
+            return f"no finite return at step {step}"
+        live.report(point[CURVE], number)
+        early = number < self.search.pruner.warmup or OBJECTIVE in point
+        return "" if early or not live.should_prune() else f"behind the others at step {step}"
 
     def complete(self, trial: Asked, returns: Sequence[float]) -> float:
         """Close a trial with the final return of each seed; their mean is its value."""
         value = math.fsum(returns) / len(returns)
-        live = self.live.pop(trial.origin)
+        live = self.live.pop(trial.place)
         live.set_user_attr("returns", list(returns))
         self.study.tell(live, value)
         return value
 
     def prune(self, trial: Asked, why: str) -> None:
         """Close a trial that is given up. It stays in the budget, and the sampler learns from it."""
-        self._close(trial.origin, "pruned", why, TrialState.PRUNED)
+        self._close(trial.place, "pruned", why, TrialState.PRUNED)
 
     def fail(self, trial: Asked, error: str) -> None:
         """Close a trial that raised."""
-        self._close(trial.origin, "error", error, TrialState.FAIL)
+        self._close(trial.place, ERROR, error, TrialState.FAIL)
 
     def _close(self, number: int, key: str, text: str, state: TrialState) -> None:
         live = self.live.pop(number)
@@ -186,12 +191,11 @@ class Ledger:
 
     def best(self) -> Best | None:
         """The finished trial with the highest value, the earliest among equals."""
-        done = [t for t in self.latest().values() if t.state == TrialState.COMPLETE]
+        done = [(p, t) for p, t in sorted(self.latest().items()) if t.state == TrialState.COMPLETE]
         if not done:
             return None
-        trial = max(done, key=lambda t: (t.value, -origin(t)))
-        assert trial.value is not None
-        return Best(origin(trial), trial.params, trial.value, trial.user_attrs["returns"])
+        place, trial = max(done, key=lambda both: both[1].values[0])
+        return Best(place, trial.params, trial.values[0], trial.user_attrs["returns"])
 
     def counts(self) -> dict[str, int]:
         """How many trials of the budget are in which state."""
@@ -202,14 +206,14 @@ class Ledger:
         return counted | {"missing": max(0, self.search.trials - len(states))}
 
 
-def origin(trial: FrozenTrial) -> int:
-    """The number that a trial was first asked under."""
-    return int(trial.user_attrs.get("origin", trial.number))
+def place_of(trial: FrozenTrial) -> int | None:
+    """The place in the budget, from 0; None for a trial that died before it had one."""
+    return trial.user_attrs.get(PLACE)
 
 
-def error_of(trial: FrozenTrial) -> str:
-    """What a trial raised, or nothing."""
-    return str(trial.user_attrs.get("error", ""))
+def values_of(trial: FrozenTrial) -> dict[str, Any]:
+    """What a trial tries, also while it waits."""
+    return trial.params | trial.system_attrs.get("fixed_params", {})
 
 
 def study_name(search: Search, arm: str, fingerprint: str) -> str:
@@ -217,26 +221,27 @@ def study_name(search: Search, arm: str, fingerprint: str) -> str:
     return f"{search.name} ({search.profile}) / {arm} / {search.identity(arm, fingerprint)}"
 
 
-def stale(search: Search, arm: str, fingerprint: str, storage: BaseStorage) -> int:
-    """Trials of the same arm under other settings or other code."""
-    name = study_name(search, arm, fingerprint)
-    names = optuna.get_all_study_names(storage)
+def look(search: Search, arm: str, fingerprint: str, storage: BaseStorage) -> tuple[Ledger, int]:
+    """An arm's ledger for reading, empty where there is none, and how many trials have other settings or other code."""
+    name, names = study_name(search, arm, fingerprint), optuna.get_all_study_names(storage)
     others = [n for n in names if n != name and n.rpartition(" / ")[0] == name.rpartition(" / ")[0]]
-    return sum(len(optuna.load_study(study_name=n, storage=storage).get_trials(deepcopy=False)) for n in others)
+    stale = sum(len(optuna.load_study(study_name=n, storage=storage).get_trials(deepcopy=False)) for n in others)
+    return Ledger(search, arm, fingerprint, storage if name in names else InMemoryStorage()), stale
 
 
 # From the file's words to Optuna's
 
 
-def distribution(one: Dimension) -> BaseDistribution:
-    """A dimension as Optuna names it."""
+def suggest(trial: optuna.Trial, name: str, one: Dimension) -> Value:
+    """Let Optuna choose from a dimension."""
     if one.choices is not None:
-        return CategoricalDistribution(one.choices)
+        chosen: Value = trial.suggest_categorical(name, one.choices)
+        return chosen
     assert one.low is not None
     assert one.high is not None
     if one.whole:
-        return IntDistribution(int(one.low), int(one.high), log=one.log, step=int(one.step or 1))
-    return FloatDistribution(one.low, one.high, log=one.log, step=one.step)
+        return trial.suggest_int(name, int(one.low), int(one.high), log=one.log, step=int(one.step or 1))
+    return trial.suggest_float(name, one.low, one.high, log=one.log, step=one.step)
 
 
 def make_sampler(cfg: Sampler, place: int) -> BaseSampler:
@@ -252,8 +257,30 @@ def make_pruner(cfg: Pruner) -> BasePruner:
     if cfg.kind == "median":
         return MedianPruner(n_startup_trials=cfg.startup, n_warmup_steps=cfg.warmup)
     if cfg.kind == "asha":
-        return SuccessiveHalvingPruner(min_resource=cfg.warmup, reduction_factor=cfg.reduction)
+        return Asha(min_resource=cfg.warmup, reduction_factor=cfg.reduction)
     return NopPruner()
+
+
+class Asha(SuccessiveHalvingPruner):
+    """Optuna's, but that a trial does not compete with what was left of it when it was interrupted."""
+
+    def prune(self, study: optuna.Study, trial: FrozenTrial) -> bool:
+        """Whether to give the trial up."""
+        return super().prune(cast(optuna.Study, _Standing(study)), trial)
+
+
+class _Standing:
+    """A study without its failed trials."""
+
+    def __init__(self, study: optuna.Study) -> None:
+        self.study = study
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.study, name)
+
+    def get_trials(self, deepcopy: bool = True) -> list[FrozenTrial]:
+        """As the study's."""
+        return [trial for trial in self.study.get_trials(deepcopy) if trial.state != TrialState.FAIL]
 
 
 # The database
@@ -293,6 +320,8 @@ def _open(url: str, write: bool) -> BaseStorage | None:
 
 def _create(file: Path) -> None:
     """Make a SQLite database where there is none: whoever dies meanwhile leaves none, not a half."""
+    if not file.parent.is_dir():
+        raise StoreError(f"{file.parent}: no such folder (for Optuna's database)")
     with FileLock(f"{file}.lock"):
         if file.exists() and file.stat().st_size > 0:
             return
