@@ -86,7 +86,7 @@ class Dimension(Frozen):
 
     def __str__(self) -> str:
         if self.choices is not None:
-            return "{" + ", ".join(str(value) for value in self.choices) + "}"
+            return "{" + ", ".join(v if isinstance(v, str) else json.dumps(v) for v in self.choices) + "}"
         notes = (", log" if self.log else "") + ("" if self.step is None else f", step {self.step:g}")
         return f"{self.low:g} to {self.high:g}{notes}"
 

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from pipelines.errors import InputError
+
 if TYPE_CHECKING:
     from pipelines.search import Search
 
@@ -42,6 +44,8 @@ def check(file: File, profile: Profile = "quick", overrides: Sets = None) -> Non
 def run(file: File, profile: Profile = "quick", overrides: Sets = None, out: Out = None) -> None:
     """Try what a search still lacks. Finished trials are kept, interrupted ones continue; the winners are written."""
     search = _search(file, profile, overrides)
+    if out is not None and out.exists() and not out.is_dir():
+        raise InputError(f"--out: {out} is not a folder")
     from pipelines.search_run import run_search
     from pipelines.store import work_folder
 

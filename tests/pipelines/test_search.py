@@ -21,6 +21,7 @@ from optuna.storages import InMemoryStorage
 from rich.console import Console
 from ruamel.yaml import YAML
 
+from pipelines import cli
 from pipelines.found import file_name, winner_yaml
 from pipelines.mlflow_tracker import open_existing
 from pipelines.pool import Failed
@@ -208,7 +209,8 @@ def test_a_fault_names_the_column_of_the_value() -> None:
 
 
 def test_a_combination_that_the_method_refuses_is_found_in_the_check() -> None:
-    arm = "  RHMC: {algo: {kind: rhmc}, space: {regulator: {choices: [none, exact]}, high_reward: {choices: [assigned, team]}}}\n"
+    space = "{regulator: {choices: [none, exact]}, high_reward: {choices: [assigned, team]}}"
+    arm = f"  RHMC: {{algo: {{kind: rhmc}}, space: {space}}}\n"
     with pytest.raises(
         StudyError, match=r"7:\d+: arms.RHMC.space: 'rhmc' refuses regulator='exact', high_reward='team': "
     ):
@@ -673,6 +675,58 @@ def test_trials_of_other_code_are_stale(tmp_path: Path) -> None:
     assert (ledger.closed, stale) == (5, 0)
 
 
+# The command
+
+Rhmc = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def rhmc(project: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Rhmc:
+    """Calls `rhmc search` in a project that holds the search."""
+    load()
+    monkeypatch.setenv("RHMC_HOME", str(project / "work"))
+
+    def call(*words: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["rhmc", "search", *words])
+        with pytest.raises(SystemExit) as caught:
+            cli.main()
+        out, err = capfd.readouterr()
+        return int(caught.value.code or 0), out, err
+
+    return call
+
+
+def test_check_prints_spaces_and_budget(rhmc: Rhmc, project: Path) -> None:
+    code, out, err = rhmc("check", "studies/search_x.yaml", "--set", "trials=7")
+    assert (code, err) == (0, "")
+    lines = out.splitlines()
+    assert lines[:4] == ["search_x (quick): Which?", "IQL: iql", "  lr: 0.0001 to 0.01, log", "  gamma: 0.5 to 0.9"]
+    assert lines[6:] == [
+        "  batch: 16 to 32",
+        "  double: {true, false}",
+        "each arm: 7 trials x 2 seeds x 600 environment steps, 8,400 in all; "
+        "sampler tpe, pruner none, 2 trials at a time",
+    ]
+
+
+@pytest.mark.parametrize("verb", ["check", "run", "status"])
+def test_a_faulty_search_is_refused_by_every_verb(rhmc: Rhmc, project: Path, verb: str) -> None:
+    gamma = "arms.IQL.space.gamma"
+    code, out, err = rhmc(verb, "studies/search_x.yaml", "--set", "trials=0")
+    assert (code, out) == (2, "")
+    assert err == "--set trials=0: trials: 0 is not allowed; must be greater than or equal to 1\n"
+    code, out, err = rhmc(verb, "studies/search_x.yaml", "--set", f"{gamma}.high=3")
+    assert (code, out) == (2, "")
+    assert err == f"--set {gamma}.high=3: {gamma}.high: 3 is not allowed; must be less than or equal to 1\n"
+    assert not (project / "work").exists()
+
+
+def test_a_file_is_no_folder_for_winners(rhmc: Rhmc, project: Path) -> None:
+    said = rhmc("run", "studies/search_x.yaml", "--out", "studies/search_x.yaml")
+    assert said == (2, "", "--out: studies/search_x.yaml is not a folder\n")
+    assert not (project / "work").exists()
+
+
 # The whole chain
 
 
@@ -749,9 +803,11 @@ def wait_for(work: Path, ready: Callable[[], bool], process: subprocess.Popen[by
 
 
 def interrupt(work: Path) -> None:
-    """Ctrl-C once the launch has begun to train."""
+    """Ctrl-C once the launch listens and has trained on."""
+    before = set(work.glob("checkpoints/*/0*.pt"))
     for _ in range(12_000):
-        if list(work.glob("ray/*")) and list(work.glob("checkpoints/*/0*.pt")):
+        listens = signal.getsignal(signal.SIGINT) is not signal.default_int_handler
+        if listens and set(work.glob("checkpoints/*/0*.pt")) - before:
             os.kill(os.getpid(), signal.SIGINT)
             return
         time.sleep(0.02)
