@@ -191,11 +191,12 @@ class Ledger:
 
     def best(self) -> Best | None:
         """The finished trial with the highest value, the earliest among equals."""
-        done = [(p, t) for p, t in sorted(self.latest().items()) if t.state == TrialState.COMPLETE]
+        closed = ((place, t) for place, t in sorted(self.latest().items()) if t.state == TrialState.COMPLETE)
+        done = [(t.value, place, t) for place, t in closed if t.value is not None]  # a pruned one has a value as well
         if not done:
             return None
-        place, trial = max(done, key=lambda both: both[1].values[0])
-        return Best(place, trial.params, trial.values[0], trial.user_attrs["returns"])
+        value, place, trial = max(done, key=lambda one: one[0])
+        return Best(place, trial.params, value, trial.user_attrs["returns"])
 
     def counts(self) -> dict[str, int]:
         """How many trials of the budget are in which state."""
