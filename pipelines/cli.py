@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pipelines.errors import InputError
+from pipelines.search_cli import app as search_app
 
 if TYPE_CHECKING:
     from pipelines.study import Study
@@ -42,6 +43,7 @@ study_app = typer.Typer(help="Check, run and follow studies.", no_args_is_help=T
 yardsticks_app = typer.Typer(help="Score scripted policies and bounds.", no_args_is_help=True)
 app.add_typer(study_app, name="study")
 app.add_typer(yardsticks_app, name="yardsticks")
+app.add_typer(search_app, name="search")
 
 
 def main() -> None:

@@ -141,7 +141,7 @@ class MlflowTracker:
                     self._reopen(run)
                     seen = {(row.metric, row.step) for row in self.rows([run.info.run_id])}
                     return MlflowRun(self.client, self.uri, run.info.run_id, seen)
-            run = self._create(f"{card.arm} s{card.seed}", self._tags(card))
+            run = self._create(card.name, self._tags(card))
             self.client.log_batch(run.info.run_id, params=[Param(k, v) for k, v in card.params.items()])
         return MlflowRun(self.client, self.uri, run.info.run_id, set())
 
@@ -186,6 +186,12 @@ class MlflowTracker:
                 for run, step, metric, value, is_nan in database.execute(query, (ref,)):
                     first.setdefault((run, step, metric), float("nan") if is_nan else value)
         return (Row(*place, value) for place, value in first.items())
+
+    def keep(self, path: Path) -> None:
+        """See `Tracker`."""
+        assert self.parent is not None
+        with explained(self.uri):
+            self.client.log_artifact(self.parent, str(path))
 
     def close(self, status: Status) -> None:
         """See `Tracker`."""

@@ -182,5 +182,6 @@ def print_table(console: Console, header: list[str], rows: list[list[str]]) -> N
     for row in rows:
         table.add_row(*row)
     if not console.is_terminal:  # nothing to fit into: no column is cut
-        console.width = max(console.width, console.measure(table).maximum)
+        wide = console.options.update(max_width=10_000)
+        console.width = max(console.width, console.measure(table, options=wide).maximum)
     console.print(table)

@@ -169,13 +169,18 @@ def why(trial: Trial) -> tuple[str, str]:
     if trial.pickled_error_file:
         with suppress(Exception):  # what a library raised need not survive being pickled
             error = pickle.loads(Path(trial.pickled_error_file).read_bytes())
-    cause = getattr(error, "cause", None) or error
-    if cause is None:
+    if error is None:
         lines = [line.strip() for line in trace.splitlines() if line.strip()]
         return (lines[-1] if lines else "no reason given"), trace
+    return cause_of(error), trace
+
+
+def cause_of(error: BaseException) -> str:
+    """One line on what a worker raised, from what Ray made of it."""
+    cause = getattr(error, "cause", None) or error
     if isinstance(cause, StoreError):
-        return str(cause), trace
+        return str(cause)
     lines = [line.strip() for line in str(cause).splitlines() if line.strip()]
     if len(lines) > 1 and "creation task" in lines[0]:  # setup raised; the error ends Ray's traceback
-        return lines[-1].removeprefix("pipelines.store.StoreError: "), trace
-    return f"{type(cause).__name__}: {one_line(cause)}", trace
+        return lines[-1].removeprefix("pipelines.store.StoreError: ")
+    return f"{type(cause).__name__}: {one_line(cause)}"

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from pipelines.fingerprint import fingerprint
 from pipelines.plan import Item, commit, finished, items, study_card
-from pipelines.progress import board, print_table
+from pipelines.progress import Board, board, print_table
 from pipelines.recorder import Recorder
 from pipelines.store import Home, StoreError
 from pipelines.study import Study
@@ -93,7 +93,7 @@ def train(study: Study, recorder: Recorder, home: Home) -> None:
         StoreError: the log failed, or Ray cannot be reached.
         KeyboardInterrupt: interrupted a second time, before every run had saved itself.
     """
-    os.environ.update({name: os.environ.get(name, value) for name, value in RAY_SETTINGS.items()})
+    set_up_ray()
     from pipelines.ray_driver import fit, ray_session  # 3 s
 
     scratch = home.scratch(study.name, study.profile)
@@ -111,21 +111,26 @@ def train(study: Study, recorder: Recorder, home: Home) -> None:
         for item in recorder.todo()
     ]
     try:
-        with ray_session(study.resources.concurrent * study.resources.cpus), interrupt_to(stop, recorder):
+        with ray_session(study.resources.concurrent * study.resources.cpus), interrupt_to(stop, recorder.board):
             fit(jobs, recorder, scratch, study.resources.concurrent, study.resources.cpus, stop)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
 
 
+def set_up_ray() -> None:
+    """Ray reads its settings when it is imported."""
+    os.environ.update({name: os.environ.get(name, value) for name, value in RAY_SETTINGS.items()})
+
+
 @contextmanager
-def interrupt_to(stop: Path, recorder: Recorder) -> Iterator[None]:
+def interrupt_to(stop: Path, board: Board) -> Iterator[None]:
     """The first Ctrl-C (or SIGTERM) asks every run to save itself and end; the second one leaves at once."""
 
     def handle(number: int, frame: FrameType | None) -> None:
         if stop.exists():
             raise KeyboardInterrupt
         stop.touch()
-        recorder.board.say("interrupted: each run stops at its next point and saves itself; again to leave at once")
+        board.say("interrupted: each run stops at its next point and saves itself; again to leave at once")
 
     before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
     try:

@@ -36,6 +36,7 @@ class Home:
         self.root = root.resolve()
         self.database = self.root / "mlflow.db"
         self.artifacts = self.root / "artifacts"
+        self.searches = self.root / "optuna.db"
 
     def checkpoints(self, key: str) -> Path:
         """Where the checkpoints of a run (spec id and fingerprint) lie."""

@@ -10,12 +10,13 @@ import json
 from collections.abc import Iterable, Sequence
 from functools import reduce
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Generic, NamedTuple, Self, TypeVar
 
 from pydantic import BaseModel, Field, field_validator
 
 from pipelines.document import Fault, Node, Place, Unreadable, choices, join, merge, override, read, show, validate
 from pipelines.errors import InputError
+from pipelines.include import included
 from rhmc import trainer
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import ENVS, EnvConfig
@@ -28,6 +29,7 @@ TABLES: dict[str, dict[str, type[Any]]] = {  # the configuration of every kind
     "algo": {kind: method.config for kind, method in ALGORITHMS.items()},
 }
 TWIN = "is the same as arm"
+M = TypeVar("M", bound=BaseModel)
 COMMON = {"env": "observation", "algo": "encoder"}  # what must not differ between methods by oversight
 
 
@@ -112,30 +114,14 @@ class Study(Frozen):
         Raises:
             StudyError: with every fault found.
         """
-        path = Path(path)
-        faults = [] if profile in PROFILES else [_no_profile(profile)]
-        root, found = read(path)
-        faults += found
-        if root is None or not isinstance(root.value, dict):
-            raise StudyError(faults or [_no_mapping(path, root)])
-        if not path.stem.replace("_", "").replace("-", "").isalnum():
-            faults.append(Fault(Place(str(path)), "", "a study's file is named with letters, digits, '-' and '_' only"))
-        patches, found = _patches(root, overrides)
-        root = _normal(reduce(merge, patches, root))
-        file, structure = validate(File, root)
-        settings = {name: _settings(root, name, patches) for name in PROFILES}
-        wanted = settings.get(profile) or settings[PROFILES[0]]
-        faults += found + structure
-        # An arm that is wrong in its shape resolves to the base: that it is the same as another is no news then.
-        faults += [f for one in settings.values() for f in one.faults if not (structure and TWIN in f.text)]
-        if file is not None and profile in PROFILES:
-            faults += [f for name in ("seeds", "steps") for f in _no_value(root, name, profile)]
-        if faults or file is None or wanted.base is None:
-            raise StudyError(faults)
+        loaded = load_layers(Path(path), File, profile, overrides, ("seeds", "steps"))
+        file, wanted = loaded.file, loaded.wanted
+        if loaded.faults or file is None or wanted.base is None:
+            raise StudyError(_no_study(loaded.root) or loaded.faults)
         resolved = {"seeds": getattr(file.seeds, profile), "steps": getattr(file.steps, profile)}
         fixed = {"question": file.question.strip(), "resources": file.resources, "profile": profile}
         fixed |= {"file": str(path), "overrides": tuple(overrides)}
-        return cls(name=path.stem, base=wanted.base, arms=wanted.arms, **fixed, **resolved)
+        return cls(name=Path(path).stem, base=wanted.base, arms=wanted.arms, **fixed, **resolved)
 
     def runs(self) -> list[PlannedRun]:
         """Every run: arms in the file's order, seeds 0, 1, ..."""
@@ -210,6 +196,63 @@ class File(Frozen):
     resources: Resources = Resources()
 
 
+# Reading
+
+
+class Resolved(NamedTuple):
+    """The layers of a file merged for one profile."""
+
+    base: Setting | None
+    arms: dict[str, Setting]
+    faults: list[Fault]
+
+
+class Loaded(NamedTuple, Generic[M]):
+    """A file whose layers are merged, and every fault so far; `file` is None where its shape is wrong."""
+
+    file: M | None
+    root: Node
+    wanted: Resolved
+    faults: list[Fault]
+
+
+def load_layers(path: Path, model: type[M], profile: str, overrides: Sequence[str], counts: Sequence[str]) -> Loaded[M]:
+    """Read, merge and check what all files with arms have in common.
+
+    Args:
+        path: the file.
+        model: its shape.
+        profile: one of `PROFILES`.
+        overrides: see `Study.load`.
+        counts: names of the fields that hold a number for each profile.
+
+    Raises:
+        StudyError: there is no mapping to go on with.
+    """
+    faults = [] if profile in PROFILES else [_no_profile(profile)]
+    root, found = read(path)
+    faults += found
+    if root is None or not isinstance(root.value, dict):
+        raise StudyError(faults or [_no_mapping(path, root, model)])
+    if not path.stem.replace("_", "").replace("-", "").isalnum():
+        faults.append(Fault(Place(str(path)), "", "a study's file is named with letters, digits, '-' and '_' only"))
+    root, found = included(root, path.parent, SECTIONS)
+    patches, wrong = _patches(root, overrides)
+    faults += found + wrong
+    for i, patch in enumerate(patches):
+        patches[i], found = included(patch, path.parent, SECTIONS)
+        faults += found
+    root = _normal(reduce(merge, patches, root), counts)
+    file, structure = validate(model, root)
+    settings = {name: _settings(root, name, patches) for name in PROFILES}
+    faults += structure
+    # An arm that is wrong in its shape resolves to the base: that it is the same as another is no news then.
+    faults += [f for one in settings.values() for f in one.faults if not (structure and TWIN in f.text)]
+    if file is not None and profile in PROFILES:
+        faults += [f for name in counts for f in _no_value(root, name, profile)]
+    return Loaded(file, root, settings.get(profile) or settings[PROFILES[0]], faults)
+
+
 # Overrides
 
 
@@ -260,16 +303,10 @@ def _nested(parts: Sequence[str], node: Node) -> Node:
 # Layers to settings
 
 
-class _Settings(NamedTuple):
-    base: Setting | None
-    arms: dict[str, Setting]
-    faults: list[Fault]
-
-
-def _normal(root: Node) -> Node:
+def _normal(root: Node, counts: Sequence[str]) -> Node:
     """One form for what may be written shortly: a number for all profiles, an arm with nothing in it."""
     children = dict(root.children)
-    for name in ("seeds", "steps"):
+    for name in counts:
         node = children.get(name)
         if node is not None and not isinstance(node.value, dict):
             children[name] = node._replace(value=dict.fromkeys(PROFILES, node))
@@ -280,7 +317,7 @@ def _normal(root: Node) -> Node:
     return root._replace(value=children)
 
 
-def _settings(root: Node, profile: str, patches: Sequence[Node]) -> _Settings:
+def _settings(root: Node, profile: str, patches: Sequence[Node]) -> Resolved:
     """Resolve the base and every arm for a profile. Overrides of the base go before what the profile changes in it."""
     layers = [root.children.get("base"), _child(_child(root, "profiles"), profile)]
     layers += [_child(patch, "base") for patch in patches]
@@ -299,7 +336,7 @@ def _settings(root: Node, profile: str, patches: Sequence[Node]) -> _Settings:
             faults += _twin(setting, arms, arm, name)
             arms[name] = setting
     faults += [_owned(fault, names) for fault, names in owners.items()]
-    return _Settings(base, arms, faults)
+    return Resolved(base, arms, faults)
 
 
 def _setting(layers: Sequence[Node], steps: Node | None) -> tuple[Setting | None, list[Fault]]:
@@ -372,11 +409,18 @@ def _no_profile(profile: str) -> Fault:
     return Fault(Place("--profile"), "", f"{show(profile)} is not allowed; {choices(profile, PROFILES)}")
 
 
-def _no_mapping(path: Path, root: Node | None) -> Fault:
+def _no_mapping(path: Path, root: Node | None, model: type[BaseModel]) -> Fault:
     if root is None or root.value is None:
-        return Fault(Place(str(path), 1, 1), "", f"empty; a study has {', '.join(File.model_fields)}")
-    text = f"{show(root.value)} is not a study; must be a mapping with {', '.join(File.model_fields)}"
+        return Fault(Place(str(path), 1, 1), "", f"empty; a study has {', '.join(model.model_fields)}")
+    text = f"{show(root.value)} is not a study; must be a mapping with {', '.join(model.model_fields)}"
     return Fault(root.place, "", text)
+
+
+def _no_study(root: Node) -> list[Fault]:
+    """Say this alone where a search was given."""
+    if not any("space" in arm.children for arm in root.children.get("arms", root).children.values()):
+        return []
+    return [Fault(Place(root.place.source, 1, 1), "", "an arm has a space: a search, for `rhmc search`, is no study")]
 
 
 def _no_value(root: Node, name: str, profile: str) -> list[Fault]:

@@ -75,7 +75,10 @@ def test_reading_a_study_needs_no_ray_and_no_mlflow() -> None:
     assert imported({"ray", "mlflow", "pandas"}, words)[-1] == "[]"
 
 
-@pytest.mark.parametrize("words", [[], ["study"], ["yardsticks"], ["study", "run"], ["ui"], ["export"], ["report"]])
+VERBS = [[], ["study"], ["search"], ["yardsticks"], ["study", "run"], ["search", "run"], ["ui"], ["export"], ["report"]]
+
+
+@pytest.mark.parametrize("words", VERBS)
 def test_every_verb_explains_itself(rhmc: Rhmc, words: list[str]) -> None:
     said = rhmc(*words, "--help")
     assert (said.code, said.err) == (0, "")
