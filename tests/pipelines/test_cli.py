@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import pandas as pd
 import pytest
 
 from pipelines import cli
+from pipelines.commands import ui
 from pipelines.fingerprint import fingerprint
 
 ROOT = Path(__file__).parents[2]
@@ -310,17 +312,17 @@ def test_ui_of_a_server_elsewhere_is_its_address(rhmc: Rhmc, monkeypatch: pytest
 
 
 class Server:
-    """Stands for the server's process."""
+    """Stands for the server's process: interrupted while it is waited for, then it ends."""
 
     given: tuple[list[str], dict[str, str]]
+    pid = 4711
 
-    def __init__(self, command: list[str], env: dict[str, str]) -> None:
+    def __init__(self, command: list[str], env: dict[str, str], *, start_new_session: bool) -> None:
+        assert start_new_session
         Server.given = command, env
-        self.waits = 0
 
-    def wait(self) -> int:
-        self.waits += 1
-        if self.waits == 1:
+    def wait(self, timeout: float | None = None) -> int:
+        if timeout is None:
             raise KeyboardInterrupt
         return -2
 
@@ -339,8 +341,12 @@ def test_ui_serves_the_store_on_this_machine_only_until_ctrl_c(
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    monkeypatch.setattr(cli, "subprocess", SimpleNamespace(Popen=Server))
+    killed: list[tuple[int, int]] = []
+    monkeypatch.setattr(ui, "subprocess", SimpleNamespace(Popen=Server))
+    monkeypatch.setattr(ui.os, "killpg", lambda *given: killed.append(given))
+    monkeypatch.setattr(ui.signal, "signal", lambda *given: None)
     said = rhmc("ui", "--port", str(port))
+    assert killed == [(Server.pid, signal.SIGTERM)]
     command, env = Server.given
     assert said.code == 0
     assert said.out.startswith(f"http://127.0.0.1:{port}/#/experiments?workflowType=machine_learning ")
@@ -352,7 +358,7 @@ def test_ui_serves_the_store_on_this_machine_only_until_ctrl_c(
 
 
 def test_ui_on_a_port_that_is_taken(rhmc: Rhmc, store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cli, "subprocess", None)
+    monkeypatch.setattr(ui, "subprocess", None)
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
