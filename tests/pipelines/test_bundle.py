@@ -136,7 +136,7 @@ DAMAGE = {
     "cut table": (lambda b: (b / "runs.parquet").write_bytes((b / "runs.parquet").read_bytes()[:-9]), "arquet"),
     "foreign table": (lambda b: shutil.copy(b / "points.parquet", b / "runs.parquet"), "has other columns"),
     "other settings": (lambda b: other(b, "runs.parquet", key="abc"), "slow s0 are not those of its key"),
-    "no settings": (lambda b: other(b, "runs.parquet", config="{}"), "."),
+    "no settings": (lambda b: other(b, "runs.parquet", config="{}"), "Field required"),
     "policy": (lambda b: next((b / "policies").iterdir()).write_bytes(b"x"), "has changed since it was written"),
     "no policy": (lambda b: next((b / "policies").iterdir()).unlink(), ".pt in it"),
     "no final value": (lambda b: other(b, "points.parquet", metric="x"), "is called finished and has no final value"),
