@@ -3,7 +3,6 @@
 The same search gives the same bytes: no clock, no path of this machine.
 """
 
-import os
 import re
 from contextlib import suppress
 from io import StringIO
@@ -13,7 +12,7 @@ from typing import Any
 from ruamel.yaml import YAML
 
 from pipelines.search import Search
-from pipelines.store import StoreError
+from pipelines.store import whole
 from pipelines.trials import OBJECTIVE, Best
 
 
@@ -74,14 +73,8 @@ def write_text(path: Path, text: str) -> None:
     Raises:
         StoreError: it cannot be written.
     """
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
-    try:
-        if path.is_file() and path.read_text(encoding="utf-8") == text:
+    with suppress(OSError):  # what cannot be read is written anew
+        if path.read_bytes() == text.encode():
             return
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with whole(path) as part:
         part.write_text(text, encoding="utf-8")
-        part.replace(path)
-    except OSError as error:
-        with suppress(OSError):
-            part.unlink(missing_ok=True)
-        raise StoreError(f"{path}: cannot be written: {error.strerror or error}") from error

@@ -36,7 +36,7 @@ def included(root: Node, folder: Path, sections: Sequence[str]) -> tuple[Node, l
 def _layers(root: Node) -> Iterator[tuple[str, ...]]:
     """The way to each layer that is written."""
     yield ("base",)
-    for group in ("profiles", "arms"):
+    for group in ("profiles", "arms", "variants"):
         if group in root.children:
             yield from ((group, name) for name in root.children[group].children)
 

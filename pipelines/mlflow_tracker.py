@@ -13,7 +13,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from filelock import FileLock
 
@@ -263,6 +263,33 @@ def charts(uri: str, server: str) -> list[tuple[str, str]]:
     with explained(uri):
         found = MlflowClient(uri, uri).search_experiments(max_results=1000, order_by=["name ASC"])
     return [(e.name, f"{server}/#/experiments/{e.experiment_id}/runs?{view}") for e in found if e.name != "Default"]
+
+
+class Counted(NamedTuple):
+    """A run, wherever it is logged."""
+
+    experiment: str
+    status: Status
+    fingerprint: str
+
+
+def census(home: Home) -> list[Counted] | None:
+    """Every run of every study in the store; None where there is no database yet.
+
+    Raises:
+        StoreError: the store cannot be reached, or is not MLflow's.
+    """
+    uri = tracking_uri(home)
+    if uri.startswith("sqlite:") and (not sqlite_file(uri).exists() or sqlite_file(uri).stat().st_size == 0):
+        return None  # asking would make one
+    reader = MlflowTracker(StudyCard("", "", ""), home, write=False)
+    with explained(uri):
+        names = {e.experiment_id: e.name for e in reader.client.search_experiments(max_results=1000)}
+        runs = reader._search("tags.role = 'run'", list(names))
+    return [
+        Counted(names[run.info.experiment_id], _recorded(run).status, run.data.tags.get("fingerprint", ""))
+        for run in runs
+    ]
 
 
 def open_existing(study: StudyCard, home: Home) -> MlflowTracker | None:

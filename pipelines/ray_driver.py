@@ -88,6 +88,8 @@ def fit(jobs: list[dict[str, Any]], recorder: Recorder, scratch: Path, concurren
             callbacks=[bridge],
             stop=Halt(bridge),
             failure_config=tune.FailureConfig(max_failures=0),
+            # Left open, Tune would save every run once more at its end, also one that was stopped before it began.
+            checkpoint_config=tune.CheckpointConfig(checkpoint_at_end=False),
         ),
     )
     tuner.fit()
@@ -125,8 +127,10 @@ class Bridge(tune.Callback):
 
     def on_trial_error(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
         """Ray calls this when a worker raised or died."""
-        self.live.discard(key_of(trial))
-        self._safely(self.recorder.failed, key_of(trial), *why(trial))
+        key = key_of(trial)
+        self.live.discard(key)
+        if key in self.recorder.logs or not self.stop.exists():  # what had not begun when all was stopped just waits
+            self._safely(self.recorder.failed, key, *why(trial))
 
     def _safely(self, call: Any, *args: Any) -> None:
         if self.error:

@@ -1,5 +1,6 @@
 """Launch a study: what its plan still lacks goes through Ray Tune, results go to the log as they come."""
 
+import json
 import os
 import shlex
 import shutil
@@ -162,7 +163,8 @@ def _summary(study: Study, recorder: Recorder, tracker: "MlflowTracker") -> None
 def _arguments(study: Study) -> str:
     """What names this plan on the command line."""
     changes = [word for text in study.overrides for word in ("--set", text)]
-    return shlex.join([study.file or f"studies/{study.name}.yaml", "--profile", study.profile, *changes])
+    variant = ["--variant", study.variant] if study.variant else []
+    return shlex.join([study.file or f"studies/{study.name}.yaml", "--profile", study.profile, *variant, *changes])
 
 
 def _arms(plan: list[Item], tracker: Tracker) -> list[list[str]]:
@@ -182,24 +184,29 @@ def _arms(plan: list[Item], tracker: Tracker) -> list[list[str]]:
     return table
 
 
-def show_status(study: Study, home: Path) -> int:
+STATES = ("finished", "running", "interrupted", "failed", "missing")
+
+
+def show_status(study: Study, home: Path, *, as_json: bool = False) -> int:
     """Print how far a study is: per arm the runs finished, under way, failed, missing, and stale (of other code).
 
     Returns:
         0 all finished, 1 not, 2 something is in the way.
     """
     try:
-        table, complete = _status(study, Home(home))
+        arms, complete = _status(study, Home(home))
     except StoreError as error:
         print(f"rhmc: {error}", file=sys.stderr)
         return BAD
-    print_table(
-        Console(), ["arm", "planned", "finished", "running", "interrupted", "failed", "missing", "stale"], table
-    )
+    if as_json:
+        print(json.dumps({"study": study.name, "profile": study.profile, "finished": complete, "arms": arms}))
+    else:
+        columns = ["planned", *STATES, "stale"]
+        print_table(Console(), ["arm", *columns], [[arm, *(str(one[c]) for c in columns)] for arm, one in arms.items()])
     return DONE if complete else FAILED
 
 
-def _status(study: Study, home: Home) -> tuple[list[list[str]], bool]:
+def _status(study: Study, home: Home) -> tuple[dict[str, dict[str, int]], bool]:
     from pipelines.mlflow_tracker import open_existing
 
     tracker = open_existing(study_card(study), home)
@@ -207,10 +214,9 @@ def _status(study: Study, home: Home) -> tuple[list[list[str]], bool]:
     plan = items(study, fingerprint(), "")
     state = {(run.arm, run.key): run.status for run in recorded}
     planned = {(item.card.arm, item.key) for item in plan}
-    table = []
+    arms = {}
     for arm in dict.fromkeys(item.card.arm for item in plan):
         mine = [state.get(place, "missing") for place in planned if place[0] == arm]
         stale = len([run for run in recorded if run.arm == arm and (run.arm, run.key) not in planned])
-        kinds = ("finished", "running", "interrupted", "failed", "missing")
-        table.append([arm, str(len(mine)), *(str(mine.count(kind)) for kind in kinds), str(stale)])
-    return table, planned <= finished(recorded)
+        arms[arm] = {"planned": len(mine)} | {kind: mine.count(kind) for kind in STATES} | {"stale": stale}
+    return arms, planned <= finished(recorded)

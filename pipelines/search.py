@@ -12,7 +12,7 @@
     pruner: {kind: median}
 
 An arm may change the method and nothing else: task, evaluation, trials, seeds and steps are the same for all arms, so
-that no method is searched harder than another. Nothing here knows Optuna.
+that no method is searched harder than another. There is neither a grid nor a variant. Nothing here knows Optuna.
 """
 
 import hashlib
@@ -30,7 +30,7 @@ from pipelines.study import (
     TWIN,
     Base,
     Counts,
-    Layers,
+    Layer,
     Resources,
     SeedCounts,
     Setting,
@@ -115,6 +115,13 @@ class SearchArm(Frozen):
     space: dict[str, Any] = Field(min_length=1)
 
 
+class Profiles(Frozen):
+    """What each profile changes in the base: no profile does with fewer arms."""
+
+    quick: Layer = Layer()
+    paper: Layer = Layer()
+
+
 class File(Frozen):
     """A search's file."""
 
@@ -126,7 +133,7 @@ class File(Frozen):
     steps: Counts
     sampler: Sampler = Sampler()
     pruner: Pruner = Pruner()
-    profiles: Layers = Layers()
+    profiles: Profiles = Profiles()
     resources: Resources = Resources()
 
 

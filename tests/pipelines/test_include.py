@@ -83,6 +83,20 @@ def test_a_base_a_profile_and_an_override_may_include() -> None:
     assert study.base.algo.horizon == 1
 
 
+def test_a_variant_may_include() -> None:
+    write("letter", "algo:\n  encoder: mlp\n")
+    load(GOOD + "variants: {letter: {algo: {include: found/letter.yaml}}}\n")
+    study = Study.load("studies/x.yaml", variant="letter")
+    assert {arm.algo.encoder for arm in study.arms.values()} == {"mlp"}
+    assert study.arms["found"].algo.alpha == pytest.approx(0.3)
+
+
+def test_a_grid_takes_what_an_arm_includes_to_every_point() -> None:
+    study = load(GOOD + "grid: {env.targets: [3, 5]}\n")
+    found = [study.arms[f"found, targets={count}"] for count in (3, 5)]
+    assert [(one.algo.horizon, one.env.targets) for one in found] == [(4, 3), (4, 5)]
+
+
 def test_a_task_may_be_included_as_well() -> None:
     write("task", "env:\n  kind: coverage\n  agents: 3\n")
     study = load(changed("env: {kind: coverage, agents: 4}", "env: {include: found/task.yaml, targets: 2}"))

@@ -187,6 +187,9 @@ LR = "lr: {low: 1e-4, high: 1e-2, log: true}\n      gamma"
         ("sampler: {startup: 2}", "pruner: {kind: asha, reduction: 1}", "20: pruner.reduction: 1 is not allowed; *"),
         ("  VDN:\n", "  VDN:\n    trainer: {steps: 9}\n", "12: arms.VDN.trainer: unknown key 'trainer'; *"),
         ("  VDN:\n", "  VDN:\n    env: {kind: coverage}\n", "12: arms.VDN.env: unknown key 'env'; *"),
+        ("seeds: 2", "grid: {algo.lr: [1e-3, 1e-2]}\nseeds: 2", "18: grid: unknown key 'grid'; allowed: question, *"),
+        ("seeds: 2", "variants: {a: {env: {agents: 3}}}\nseeds: 2", "18: variants: unknown key 'variants'; allowed: *"),
+        ("seeds: 2", "profiles: {quick: {arms: [IQL]}}\nseeds: 2", "18: profiles.quick.arms: unknown key 'arms'; *"),
         (
             "    space:\n      lr: {low: 1e-4, high: 1e-2, log: true}\n      gamma: {low: 0.5, high: 0.9}",
             "    space: {}",

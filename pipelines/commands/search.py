@@ -1,4 +1,4 @@
-"""`rhmc search`: check, run and follow searches. As in `cli`, what is heavy is imported by the verb that needs it."""
+"""`rhmc search`: check, run and follow searches."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,13 +6,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipelines.errors import InputError
+from pipelines.commands.common import Profile, files_in, folder_option, say
 
 if TYPE_CHECKING:
     from pipelines.search import Search
 
-File = Annotated[Path, typer.Argument(metavar="FILE", help="A search, such as studies/search_rhmc.yaml.")]
-Profile = Annotated[str, typer.Option(help="The budget: quick or paper.")]
+File = Annotated[
+    Path,
+    typer.Argument(
+        metavar="FILE",
+        help="A search, such as studies/search_rhmc.yaml.",
+        autocompletion=lambda incomplete: files_in("studies", "search_*.yaml", incomplete),
+    ),
+]
 Sets = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Change the search, as in a study: trials=4, base.algo.lr=1e-3."),
@@ -29,11 +35,11 @@ app = typer.Typer(help="Search settings with the same budget for every method.",
 def check(file: File, profile: Profile = "quick", overrides: Sets = None) -> None:
     """Say what a search would try, or everything that is wrong with it. Starts nothing."""
     search = _search(file, profile, overrides)
-    print(f"{search.name} ({search.profile}): {search.question}")
+    say(f"{search.name} ({search.profile}): {search.question}")
     for name, arm in search.arms.items():
-        print("\n".join([f"{name}: {arm.setting.algo.kind}", *(f"  {key}: {one}" for key, one in arm.space.items())]))
+        say("\n".join([f"{name}: {arm.setting.algo.kind}", *(f"  {key}: {one}" for key, one in arm.space.items())]))
     each = search.trials * search.seeds
-    print(
+    say(
         f"each arm: {search.trials} trials x {search.seeds} seeds x {search.steps:,} environment steps, "
         f"{each * search.steps:,} in all; sampler {search.sampler.kind}, pruner {search.pruner.kind}, "
         f"{search.resources.concurrent} trials at a time"
@@ -44,12 +50,11 @@ def check(file: File, profile: Profile = "quick", overrides: Sets = None) -> Non
 def run(file: File, profile: Profile = "quick", overrides: Sets = None, out: Out = None) -> None:
     """Try what a search still lacks. Finished trials are kept, interrupted ones continue; the winners are written."""
     search = _search(file, profile, overrides)
-    if out is not None and out.exists() and not out.is_dir():
-        raise InputError(f"--out: {out} is not a folder")
     from pipelines.search_run import run_search
     from pipelines.store import work_folder
 
-    raise typer.Exit(run_search(search, work_folder(), out))
+    with folder_option(out):
+        raise typer.Exit(run_search(search, work_folder(), out))
 
 
 @app.command("status")
