@@ -3,9 +3,7 @@
 The files are canonical: the same log gives the same bytes (sorted rows, no clock, no names that the log made up).
 """
 
-import os
 import sys
-from contextlib import suppress
 from pathlib import Path
 
 import pyarrow as pa
@@ -13,7 +11,7 @@ import pyarrow.parquet as pq
 
 from pipelines.fingerprint import fingerprint
 from pipelines.plan import Item, items, study_card
-from pipelines.store import Home, StoreError, work_folder
+from pipelines.store import Home, StoreError, whole, work_folder
 from pipelines.study import Study
 from pipelines.tracker import Recorded, Row, Tracker
 
@@ -110,12 +108,5 @@ def write_parquet(path: Path, schema: pa.Schema, rows: list[tuple[object, ...]])
     """
     columns = list(zip(*rows, strict=True)) or [()] * len(schema)
     table = pa.table([pa.array(column, field.type) for column, field in zip(columns, schema, strict=True)], schema)
-    part = path.with_suffix(f".{os.getpid()}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with whole(path) as part:
         pq.write_table(table, part, compression="zstd", version="2.6", row_group_size=2**20)
-        part.replace(path)
-    except OSError as error:
-        with suppress(OSError):
-            part.unlink(missing_ok=True)
-        raise StoreError(f"{path}: cannot be written: {error.strerror or error}") from error

@@ -1,8 +1,6 @@
 """Table 1: what the table of algorithms says of every method, with parameters counted in what it builds."""
 
 import json
-import os
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
@@ -11,7 +9,7 @@ from torch import Generator, Tensor, nn
 from torch.nn.modules.module import register_module_forward_hook
 
 from pipelines.errors import InputError
-from pipelines.store import StoreError
+from pipelines.store import whole
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import EnvConfig, coverage, make_env, navigation
 from rhmc.nets import EncoderName
@@ -78,13 +76,7 @@ def export_methods(out: Path) -> Path:
     """
     if out.exists() and not out.is_dir():
         raise InputError(f"--out: {out} is not a folder")
-    file, part = out / FILE, out / f"{FILE}.{os.getpid()}.part"
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        part.write_text(json.dumps(describe(), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-        part.replace(file)
-    except OSError as error:
-        with suppress(OSError):
-            part.unlink(missing_ok=True)
-        raise StoreError(f"{file}: cannot be written: {error.strerror or error}") from error
+    file, text = out / FILE, json.dumps(describe(), indent=1, ensure_ascii=False)
+    with whole(file) as part:
+        part.write_text(text + "\n", encoding="utf-8")
     return file

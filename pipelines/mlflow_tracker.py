@@ -13,7 +13,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from filelock import FileLock
 
@@ -23,6 +23,7 @@ from rhmc.types import Metrics
 
 os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "3")
+os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
 
 from mlflow import MlflowClient
 from mlflow.entities import Metric, Param, Run, RunTag, ViewType
@@ -141,7 +142,7 @@ class MlflowTracker:
                     self._reopen(run)
                     seen = {(row.metric, row.step) for row in self.rows([run.info.run_id])}
                     return MlflowRun(self.client, self.uri, run.info.run_id, seen)
-            run = self._create(f"{card.arm} s{card.seed}", self._tags(card))
+            run = self._create(card.name, self._tags(card))
             self.client.log_batch(run.info.run_id, params=[Param(k, v) for k, v in card.params.items()])
         return MlflowRun(self.client, self.uri, run.info.run_id, set())
 
@@ -186,6 +187,12 @@ class MlflowTracker:
                 for run, step, metric, value, is_nan in database.execute(query, (ref,)):
                     first.setdefault((run, step, metric), float("nan") if is_nan else value)
         return (Row(*place, value) for place, value in first.items())
+
+    def keep(self, path: Path) -> None:
+        """See `Tracker`."""
+        assert self.parent is not None
+        with explained(self.uri):
+            self.client.log_artifact(self.parent, str(path))
 
     def close(self, status: Status) -> None:
         """See `Tracker`."""
@@ -257,6 +264,33 @@ def charts(uri: str, server: str) -> list[tuple[str, str]]:
     with explained(uri):
         found = MlflowClient(uri, uri).search_experiments(max_results=1000, order_by=["name ASC"])
     return [(e.name, f"{server}/#/experiments/{e.experiment_id}/runs?{view}") for e in found if e.name != "Default"]
+
+
+class Counted(NamedTuple):
+    """A run, wherever it is logged."""
+
+    experiment: str
+    status: Status
+    fingerprint: str
+
+
+def census(home: Home) -> list[Counted] | None:
+    """Every run of every study in the store; None where there is no database yet.
+
+    Raises:
+        StoreError: the store cannot be reached, or is not MLflow's.
+    """
+    uri = tracking_uri(home)
+    if uri.startswith("sqlite:") and (not sqlite_file(uri).exists() or sqlite_file(uri).stat().st_size == 0):
+        return None  # asking would make one
+    reader = MlflowTracker(StudyCard("", "", ""), home, write=False)
+    with explained(uri):
+        names = {e.experiment_id: e.name for e in reader.client.search_experiments(max_results=1000)}
+        runs = reader._search("tags.role = 'run'", list(names))
+    return [
+        Counted(names[run.info.experiment_id], _recorded(run).status, run.data.tags.get("fingerprint", ""))
+        for run in runs
+    ]
 
 
 def open_existing(study: StudyCard, home: Home) -> MlflowTracker | None:

@@ -42,6 +42,11 @@ class Line:
         return f"{self.name}: {steps}, {self.rate:,.0f} steps/s, return {self.score:.2f}, {self.left} left"
 
 
+def began(reached: int, total: int) -> str:
+    """How a run starts, in words."""
+    return f"continues at step {min(reached, total):,} of {total:,}" if reached else "started"
+
+
 def duration(seconds: float) -> str:
     """Seconds as 12 s, 3:05 or 1:03:05."""
     whole = max(0, round(seconds))
@@ -60,8 +65,8 @@ class Board(Protocol):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None: ...
 
-    def start(self, name: str, total: int) -> None:
-        """A run begins or continues; `total` environment steps."""
+    def start(self, name: str, total: int, reached: int = 0) -> None:
+        """A run begins, or continues where it has `reached`; `total` environment steps."""
         ...
 
     def points(self, name: str, points: list[Metrics]) -> None:
@@ -92,10 +97,10 @@ class PlainBoard:
     ) -> None:
         pass
 
-    def start(self, name: str, total: int) -> None:
+    def start(self, name: str, total: int, reached: int = 0) -> None:
         """See `Board`."""
         self.lines[name] = Line(name, total, shown=time.monotonic())
-        self.say(f"{name}: started")
+        self.say(f"{name}: {began(reached, total)}")
 
     def points(self, name: str, points: list[Metrics]) -> None:
         """See `Board`."""
@@ -135,9 +140,11 @@ class LiveBoard:
     ) -> None:
         self.progress.stop()
 
-    def start(self, name: str, total: int) -> None:
+    def start(self, name: str, total: int, reached: int = 0) -> None:
         """See `Board`."""
         task = self.progress.add_task(name, total=total, steps="starting", rate="", score="", left="")
+        if reached:
+            self.say(f"{name}: {began(reached, total)}")
         self.lines[name] = Line(name, total), task
 
     def points(self, name: str, points: list[Metrics]) -> None:
@@ -182,5 +189,6 @@ def print_table(console: Console, header: list[str], rows: list[list[str]]) -> N
     for row in rows:
         table.add_row(*row)
     if not console.is_terminal:  # nothing to fit into: no column is cut
-        console.width = max(console.width, console.measure(table).maximum)
+        wide = console.options.update(max_width=10_000)
+        console.width = max(console.width, console.measure(table, options=wide).maximum)
     console.print(table)

@@ -88,6 +88,8 @@ def fit(jobs: list[dict[str, Any]], recorder: Recorder, scratch: Path, concurren
             callbacks=[bridge],
             stop=Halt(bridge),
             failure_config=tune.FailureConfig(max_failures=0),
+            # Left open, Tune would save every run once more at its end, also one that was stopped before it began.
+            checkpoint_config=tune.CheckpointConfig(checkpoint_at_end=False),
         ),
     )
     tuner.fit()
@@ -125,8 +127,10 @@ class Bridge(tune.Callback):
 
     def on_trial_error(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
         """Ray calls this when a worker raised or died."""
-        self.live.discard(key_of(trial))
-        self._safely(self.recorder.failed, key_of(trial), *why(trial))
+        key = key_of(trial)
+        self.live.discard(key)
+        if key in self.recorder.logs or not self.stop.exists():  # what had not begun when all was stopped just waits
+            self._safely(self.recorder.failed, key, *why(trial))
 
     def _safely(self, call: Any, *args: Any) -> None:
         if self.error:
@@ -169,13 +173,18 @@ def why(trial: Trial) -> tuple[str, str]:
     if trial.pickled_error_file:
         with suppress(Exception):  # what a library raised need not survive being pickled
             error = pickle.loads(Path(trial.pickled_error_file).read_bytes())
-    cause = getattr(error, "cause", None) or error
-    if cause is None:
+    if error is None:
         lines = [line.strip() for line in trace.splitlines() if line.strip()]
         return (lines[-1] if lines else "no reason given"), trace
+    return cause_of(error), trace
+
+
+def cause_of(error: BaseException) -> str:
+    """One line on what a worker raised, from what Ray made of it."""
+    cause = getattr(error, "cause", None) or error
     if isinstance(cause, StoreError):
-        return str(cause), trace
+        return str(cause)
     lines = [line.strip() for line in str(cause).splitlines() if line.strip()]
     if len(lines) > 1 and "creation task" in lines[0]:  # setup raised; the error ends Ray's traceback
-        return lines[-1].removeprefix("pipelines.store.StoreError: "), trace
-    return f"{type(cause).__name__}: {one_line(cause)}", trace
+        return lines[-1].removeprefix("pipelines.store.StoreError: ")
+    return f"{type(cause).__name__}: {one_line(cause)}"

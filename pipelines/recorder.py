@@ -9,6 +9,7 @@ from pipelines.plan import Item, finished, resolved_yaml
 from pipelines.progress import Board
 from pipelines.store import Checkpoints, Home
 from pipelines.tracker import RunLog, Status, StudyCard, Tracker, points_of
+from rhmc.trainer import grid_step
 
 
 class Recorder:
@@ -70,7 +71,12 @@ class Recorder:
         item = self.waiting[key][0]
         self.logs[key] = self.tracker.start(item.card)
         self.logs[key].text("config.yaml", resolved_yaml(item, self.study))
-        self.board.start(item.name, item.spec.trainer.steps)
+        self.board.start(item.name, item.spec.trainer.steps, self._reached(item))
+
+    def _reached(self, item: Item) -> int:
+        """Environment steps at the newest checkpoint, 0 without one."""
+        points = Checkpoints(self.home.checkpoints(item.key)).points()
+        return grid_step(item.spec.trainer, points - 1) if points else 0
 
     def result(self, key: str, result: dict[str, Any]) -> None:
         """New points of a training; the last ones finish its run."""

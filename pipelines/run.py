@@ -1,5 +1,6 @@
 """Launch a study: what its plan still lacks goes through Ray Tune, results go to the log as they come."""
 
+import json
 import os
 import shlex
 import shutil
@@ -15,7 +16,7 @@ from rich.console import Console
 
 from pipelines.fingerprint import fingerprint
 from pipelines.plan import Item, commit, finished, items, study_card
-from pipelines.progress import board, print_table
+from pipelines.progress import Board, board, print_table
 from pipelines.recorder import Recorder
 from pipelines.store import Home, StoreError
 from pipelines.study import Study
@@ -93,7 +94,7 @@ def train(study: Study, recorder: Recorder, home: Home) -> None:
         StoreError: the log failed, or Ray cannot be reached.
         KeyboardInterrupt: interrupted a second time, before every run had saved itself.
     """
-    os.environ.update({name: os.environ.get(name, value) for name, value in RAY_SETTINGS.items()})
+    set_up_ray()
     from pipelines.ray_driver import fit, ray_session  # 3 s
 
     scratch = home.scratch(study.name, study.profile)
@@ -111,21 +112,26 @@ def train(study: Study, recorder: Recorder, home: Home) -> None:
         for item in recorder.todo()
     ]
     try:
-        with ray_session(study.resources.concurrent * study.resources.cpus), interrupt_to(stop, recorder):
+        with ray_session(study.resources.concurrent * study.resources.cpus), interrupt_to(stop, recorder.board):
             fit(jobs, recorder, scratch, study.resources.concurrent, study.resources.cpus, stop)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
 
 
+def set_up_ray() -> None:
+    """Ray reads its settings when it is imported."""
+    os.environ.update({name: os.environ.get(name, value) for name, value in RAY_SETTINGS.items()})
+
+
 @contextmanager
-def interrupt_to(stop: Path, recorder: Recorder) -> Iterator[None]:
+def interrupt_to(stop: Path, board: Board) -> Iterator[None]:
     """The first Ctrl-C (or SIGTERM) asks every run to save itself and end; the second one leaves at once."""
 
     def handle(number: int, frame: FrameType | None) -> None:
         if stop.exists():
             raise KeyboardInterrupt
         stop.touch()
-        recorder.board.say("interrupted: each run stops at its next point and saves itself; again to leave at once")
+        board.say("interrupted: each run stops at its next point and saves itself; again to leave at once")
 
     before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
@@ -157,7 +163,8 @@ def _summary(study: Study, recorder: Recorder, tracker: "MlflowTracker") -> None
 def _arguments(study: Study) -> str:
     """What names this plan on the command line."""
     changes = [word for text in study.overrides for word in ("--set", text)]
-    return shlex.join([study.file or f"studies/{study.name}.yaml", "--profile", study.profile, *changes])
+    variant = ["--variant", study.variant] if study.variant else []
+    return shlex.join([study.file or f"studies/{study.name}.yaml", "--profile", study.profile, *variant, *changes])
 
 
 def _arms(plan: list[Item], tracker: Tracker) -> list[list[str]]:
@@ -177,24 +184,29 @@ def _arms(plan: list[Item], tracker: Tracker) -> list[list[str]]:
     return table
 
 
-def show_status(study: Study, home: Path) -> int:
+STATES = ("finished", "running", "interrupted", "failed", "missing")
+
+
+def show_status(study: Study, home: Path, *, as_json: bool = False) -> int:
     """Print how far a study is: per arm the runs finished, under way, failed, missing, and stale (of other code).
 
     Returns:
         0 all finished, 1 not, 2 something is in the way.
     """
     try:
-        table, complete = _status(study, Home(home))
+        arms, complete = _status(study, Home(home))
     except StoreError as error:
         print(f"rhmc: {error}", file=sys.stderr)
         return BAD
-    print_table(
-        Console(), ["arm", "planned", "finished", "running", "interrupted", "failed", "missing", "stale"], table
-    )
+    if as_json:
+        print(json.dumps({"study": study.name, "profile": study.profile, "finished": complete, "arms": arms}))
+    else:
+        columns = ["planned", *STATES, "stale"]
+        print_table(Console(), ["arm", *columns], [[arm, *(str(one[c]) for c in columns)] for arm, one in arms.items()])
     return DONE if complete else FAILED
 
 
-def _status(study: Study, home: Home) -> tuple[list[list[str]], bool]:
+def _status(study: Study, home: Home) -> tuple[dict[str, dict[str, int]], bool]:
     from pipelines.mlflow_tracker import open_existing
 
     tracker = open_existing(study_card(study), home)
@@ -202,10 +214,9 @@ def _status(study: Study, home: Home) -> tuple[list[list[str]], bool]:
     plan = items(study, fingerprint(), "")
     state = {(run.arm, run.key): run.status for run in recorded}
     planned = {(item.card.arm, item.key) for item in plan}
-    table = []
+    arms = {}
     for arm in dict.fromkeys(item.card.arm for item in plan):
         mine = [state.get(place, "missing") for place in planned if place[0] == arm]
         stale = len([run for run in recorded if run.arm == arm and (run.arm, run.key) not in planned])
-        kinds = ("finished", "running", "interrupted", "failed", "missing")
-        table.append([arm, str(len(mine)), *(str(mine.count(kind)) for kind in kinds), str(stale)])
-    return table, planned <= finished(recorded)
+        arms[arm] = {"planned": len(mine)} | {kind: mine.count(kind) for kind in STATES} | {"stale": stale}
+    return arms, planned <= finished(recorded)

@@ -2,7 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -36,6 +36,7 @@ class Home:
         self.root = root.resolve()
         self.database = self.root / "mlflow.db"
         self.artifacts = self.root / "artifacts"
+        self.searches = self.root / "optuna.db"
 
     def checkpoints(self, key: str) -> Path:
         """Where the checkpoints of a run (spec id and fingerprint) lie."""
@@ -110,6 +111,11 @@ class Checkpoints:
                 file.unlink(missing_ok=True)
         return None
 
+    def points(self) -> int:
+        """Points of the grid that the newest checkpoint has behind it, 0 without one. It may not be readable."""
+        files = self._files()
+        return int(files[0].stem) if files else 0
+
     def _files(self) -> list[Path]:
         return sorted(self.folder.glob("[0-9]*.pt"), reverse=True)
 
@@ -118,30 +124,47 @@ class Checkpoints:
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
+@contextmanager
+def whole(path: Path, *, durable: bool = False) -> Iterator[Path]:
+    """A part to be written, file or folder, which then takes the place of `path`: a reader meets the old or the new.
+
+    Args:
+        path: the file; its folder is made when missing.
+        durable: also after a power cut.
+
+    Raises:
+        StoreError: the disk is full or the folder closed; nothing half-written is left.
+    """
+    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield part
+        if durable:
+            sync(part)
+        part.replace(path)
+        if durable:
+            sync(path.parent)
+    except BaseException as error:
+        with suppress(OSError):
+            shutil.rmtree(part) if part.is_dir() else part.unlink(missing_ok=True)
+        if isinstance(error, OSError | RuntimeError):  # torch reports a failed write as RuntimeError
+            raise StoreError(f"{path}: cannot be written: {reason(error)}") from error
+        raise
+
+
 def save_atomically(path: Path, state: Any) -> None:
     """`torch.save` so that a reader meets the old file or the new one, also after a power cut.
 
     Raises:
         StoreError: the disk is full or the folder closed; nothing half-written is left.
     """
-    part = path.with_suffix(f".{os.getpid()}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with part.open("wb") as file:
-            torch.save(state, file)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    except (OSError, RuntimeError) as error:  # torch reports a failed write as RuntimeError
-        with suppress(OSError):
-            part.unlink(missing_ok=True)
-        raise StoreError(f"{path}: cannot be written: {reason(error)}") from error
-    sync_folder(path.parent)
+    with whole(path, durable=True) as part, part.open("wb") as file:
+        torch.save(state, file)
 
 
-def sync_folder(folder: Path) -> None:
-    """Make a rename in the folder durable."""
-    handle = os.open(folder, os.O_RDONLY)
+def sync(path: Path) -> None:
+    """Make what was written to a file, or renamed in a folder, durable."""
+    handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
     finally:
@@ -149,17 +172,24 @@ def sync_folder(folder: Path) -> None:
 
 
 def without_replay(state: Any) -> Any:
-    """A copy of a state in which every replay is empty: enough to act with, small enough to keep for good.
+    """A copy of a state without what was kept to learn from: enough to act with, small enough to keep for good.
 
-    A replay is recognised by its keys (`rows`, `next`, `size`).
+    A replay is recognised by its keys (`rows`, `next`, `size`), a half rollout by `rows`, or `rows` and `count`.
     """
     if isinstance(state, dict):
-        if state.keys() == {"rows", "next", "size"}:
-            return {"rows": {}, "next": 0, "size": 0}
+        if kind := KEPT.get(frozenset(state)):
+            return kind()
         return {key: without_replay(value) for key, value in state.items()}
     if isinstance(state, list | tuple):
         return type(state)(without_replay(value) for value in state)
     return state
+
+
+KEPT: dict[frozenset[str], Callable[[], State]] = {  # what learning keeps, by its keys, and the empty form of it
+    frozenset(("rows", "next", "size")): lambda: {"rows": {}, "next": 0, "size": 0},
+    frozenset(("rows",)): lambda: {"rows": []},
+    frozenset(("rows", "count")): lambda: {"rows": {}, "count": torch.zeros(0, dtype=torch.int64)},
+}
 
 
 def one_line(error: BaseException) -> str:

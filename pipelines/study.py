@@ -1,21 +1,25 @@
 """Studies: a YAML file says what is compared, and resolves to the runs that answer its question.
 
 A file has `question`, `base` (env, algo, trainer), `arms` (each changes the base), `seeds` and `steps` (a number, or
-one for each profile), and may have `profiles` (what else a profile changes in the base) and `resources`. The layers of
-a run are base, profile, arm. All that is wrong with a file is found before anything starts.
+one for each profile), and may have `grid` (lists of values for dotted keys: every arm, or the base without arms, is
+taken to every combination), `variants` (each changes every arm, whatever its kind), `profiles` (what else a profile
+changes in the base; the arms and the values of the grid that it is content with) and `resources`. The layers of a run
+are base, profile, arm, point of the grid, variant. All that is wrong with a file is found before anything starts.
 """
 
 import hashlib
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import reduce
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Annotated, Any, Generic, NamedTuple, Self, TypeVar
 
 from pydantic import BaseModel, Field, field_validator
 
 from pipelines.document import Fault, Node, Place, Unreadable, choices, join, merge, override, read, show, validate
 from pipelines.errors import InputError
+from pipelines.grid import Point, nested, points, replaced
+from pipelines.include import included
 from rhmc import trainer
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import ENVS, EnvConfig
@@ -23,11 +27,19 @@ from rhmc.types import Frozen
 
 PROFILES = ("quick", "paper")
 SECTIONS = ("env", "algo", "trainer")
+COUNTS = ("seeds", "steps")  # fields of a study that hold a number for each profile
 TABLES: dict[str, dict[str, type[Any]]] = {  # the configuration of every kind
     "env": {kind: entry[0] for kind, entry in ENVS.items()},
     "algo": {kind: method.config for kind, method in ALGORITHMS.items()},
 }
+NAMED = 3  # arms that a fault names
 TWIN = "is the same as arm"
+M = TypeVar("M", bound=BaseModel)
+FIELDS = [  # every dotted name of a run's settings
+    f"{section}.{field}"
+    for section, configs in (TABLES | {"trainer": {"": trainer.Config}}).items()
+    for field in sorted({name for config in configs.values() for name in config.model_fields})
+]
 COMMON = {"env": "observation", "algo": "encoder"}  # what must not differ between methods by oversight
 
 
@@ -85,9 +97,9 @@ class Resources(Frozen):
 
 
 class Study(Frozen):
-    """A study resolved for one profile: every arm is a complete setting."""
+    """A study resolved for one profile and variant: every arm is a complete setting."""
 
-    name: str
+    name: str  # the file's stem; of a variant `stem@variant`, so that its runs and results have a place of their own
     profile: str
     question: str
     base: Setting
@@ -97,9 +109,12 @@ class Study(Frozen):
     resources: Resources
     file: str = ""  # as given, for commands that a person can repeat
     overrides: tuple[str, ...] = ()
+    variant: str = ""
 
     @classmethod
-    def load(cls, path: Path | str, profile: str = "quick", overrides: Sequence[str] = ()) -> Self:
+    def load(
+        cls, path: Path | str, profile: str = "quick", overrides: Sequence[str] = (), variant: str | None = None
+    ) -> Self:
         """Read, merge and check a study.
 
         Args:
@@ -108,34 +123,20 @@ class Study(Frozen):
             overrides: `key=value`, key a dotted path of the file (`seeds`, `base.algo.lr`, `arms.full.env.agents`),
                 merged into it as an arm is into the base. `env.`, `algo.` and `trainer.` stand for `base.env.` and so
                 on, and `trainer.steps` for `steps`. They go before a profile's changes; an arm keeps what it states.
+            variant: one of the file's `variants`; None for the arms as they stand.
 
         Raises:
             StudyError: with every fault found.
         """
-        path = Path(path)
-        faults = [] if profile in PROFILES else [_no_profile(profile)]
-        root, found = read(path)
-        faults += found
-        if root is None or not isinstance(root.value, dict):
-            raise StudyError(faults or [_no_mapping(path, root)])
-        if not path.stem.replace("_", "").replace("-", "").isalnum():
-            faults.append(Fault(Place(str(path)), "", "a study's file is named with letters, digits, '-' and '_' only"))
-        patches, found = _patches(root, overrides)
-        root = _normal(reduce(merge, patches, root))
-        file, structure = validate(File, root)
-        settings = {name: _settings(root, name, patches) for name in PROFILES}
-        wanted = settings.get(profile) or settings[PROFILES[0]]
-        faults += found + structure
-        # An arm that is wrong in its shape resolves to the base: that it is the same as another is no news then.
-        faults += [f for one in settings.values() for f in one.faults if not (structure and TWIN in f.text)]
-        if file is not None and profile in PROFILES:
-            faults += [f for name in ("seeds", "steps") for f in _no_value(root, name, profile)]
-        if faults or file is None or wanted.base is None:
-            raise StudyError(faults)
-        resolved = {"seeds": getattr(file.seeds, profile), "steps": getattr(file.steps, profile)}
+        loaded = load_layers(Path(path), File, profile, overrides, COUNTS, gridded=GridFile, variant=variant)
+        file, wanted = loaded.file, loaded.wanted
+        if loaded.faults or file is None or wanted.base is None:
+            raise StudyError(_no_study(loaded.root) or loaded.faults)
+        resolved = {name: getattr(getattr(file, name), profile) for name in COUNTS}
         fixed = {"question": file.question.strip(), "resources": file.resources, "profile": profile}
-        fixed |= {"file": str(path), "overrides": tuple(overrides)}
-        return cls(name=path.stem, base=wanted.base, arms=wanted.arms, **fixed, **resolved)
+        fixed |= {"file": str(path), "overrides": tuple(overrides), "variant": variant or ""}
+        name = Path(path).stem + (f"@{variant}" if variant else "")
+        return cls(name=name, base=wanted.base, arms=wanted.arms, **fixed, **resolved)
 
     def runs(self) -> list[PlannedRun]:
         """Every run: arms in the file's order, seeds 0, 1, ..."""
@@ -191,11 +192,21 @@ class SeedCounts(Frozen):
     paper: int | None = Field(None, ge=1, le=1000)
 
 
-class Layers(Frozen):
+Grid = dict[str, Annotated[list[Any], Field(min_length=1)]]  # by dotted name of a setting
+
+
+class Profile(Layer):
+    """What a profile changes in the base, which arms it is content with, and which values of the grid."""
+
+    arms: list[str] | None = Field(None, min_length=1)
+    grid: Grid = Field(default_factory=dict)
+
+
+class Profiles(Frozen):
     """What each profile changes."""
 
-    quick: Layer = Layer()
-    paper: Layer = Layer()
+    quick: Profile = Profile()
+    paper: Profile = Profile()
 
 
 class File(Frozen):
@@ -204,10 +215,98 @@ class File(Frozen):
     question: str = Field(min_length=1)
     base: Base
     arms: dict[str, Layer] = Field(min_length=1)
+    grid: Grid = Field(default_factory=dict)
+    variants: dict[str, Layer] = Field(default_factory=dict)
     seeds: SeedCounts
     steps: Counts
-    profiles: Layers = Layers()
+    profiles: Profiles = Profiles()
     resources: Resources = Resources()
+
+
+class GridFile(File):
+    """A study's file with a grid, which need not have arms."""
+
+    arms: dict[str, Layer] = Field(default_factory=dict)
+    grid: Grid = Field(min_length=1)
+
+
+# Reading
+
+
+class Resolved(NamedTuple):
+    """The layers of a file merged for one profile and variant."""
+
+    base: Setting | None
+    arms: dict[str, Setting]
+    faults: list[Fault]
+
+
+class Loaded(NamedTuple, Generic[M]):
+    """A file whose layers are merged, and every fault so far; `file` is None where its shape is wrong."""
+
+    file: M | None
+    root: Node
+    wanted: Resolved
+    faults: list[Fault]
+
+
+def load_layers(
+    path: Path,
+    model: type[M],
+    profile: str,
+    overrides: Sequence[str],
+    counts: Sequence[str],
+    *,
+    gridded: type[M] | None = None,
+    variant: str | None = None,
+) -> Loaded[M]:
+    """Read, merge and check what all files with arms have in common.
+
+    Args:
+        path: the file.
+        model: its shape; what that does not know changes no arm.
+        profile: one of `PROFILES`.
+        overrides: see `Study.load`.
+        counts: names of the fields that hold a number for each profile.
+        gridded: its shape where it has a grid.
+        variant: one of its `variants`; None for the arms as they stand.
+
+    Raises:
+        StudyError: there is no mapping to go on with.
+    """
+    root, patches, faults = _trees(path, model, profile, overrides)
+    root = _normal(reduce(merge, patches, root), counts)
+    file, structure = validate(gridded if gridded and "grid" in root.children else model, root)
+    known = root._replace(value={key: child for key, child in root.children.items() if key in model.model_fields})
+    variants = _group(known, "variants")
+    settings = {(p, v): _settings(known, p, v, patches) for p in PROFILES for v in (None, *variants)}
+    faults += structure + _variant_faults(variants, variant)
+    # An arm that is wrong in its shape resolves to the base: that it is the same as another is no news then.
+    faults += [f for one in settings.values() for f in one.faults if not (structure and TWIN in f.text)]
+    if file is not None and profile in PROFILES:
+        faults += [f for name in counts for f in _no_value(root, name, profile)]
+    return Loaded(file, root, settings.get((profile, variant)) or settings[PROFILES[0], None], faults)
+
+
+def _trees(
+    path: Path, model: type[BaseModel], profile: str, overrides: Sequence[str]
+) -> tuple[Node, list[Node], list[Fault]]:
+    """The file and each override as a tree, what they include in its place, and the faults of the options.
+
+    Raises:
+        StudyError: there is no mapping to go on with.
+    """
+    faults = [] if profile in PROFILES else [_no_profile(profile)]
+    root, found = read(path)
+    faults += found
+    if root is None or not isinstance(root.value, dict):
+        raise StudyError(faults or [_no_mapping(path, root, model)])
+    if not _plain(path.stem):
+        faults.append(Fault(Place(str(path)), "", "a study's file is named with letters, digits, '-' and '_' only"))
+    patches, found = _patches(root, overrides)
+    whole = [included(tree, path.parent, SECTIONS) for tree in (root, *patches)]
+    faults += found + [fault for _, more in whole for fault in more]
+    return whole[0][0], [tree for tree, _ in whole[1:]], faults
 
 
 # Overrides
@@ -231,7 +330,7 @@ def _patches(root: Node, overrides: Iterable[str]) -> tuple[list[Node], list[Fau
         node, found = override(source, ".".join(parts), value)
         faults += found
         if node is not None:
-            patches.append(_nested(parts, node))
+            patches.append(nested(parts, node))
         elif not found:
             faults.append(Fault(Place(source), ".".join(parts), "no value"))
     return patches, faults
@@ -243,6 +342,10 @@ def _target(root: Node, key: str) -> list[str]:
     parts = ["base", *parts] if parts[0] in SECTIONS else parts
     if parts == ["base", "trainer", "steps"]:
         return ["steps"]
+    for i, part in enumerate(parts[:-1]):
+        of_profile = i == 2 and parts[0] == "profiles"
+        if part == "grid" and (i == 0 or of_profile):  # its keys are dotted themselves
+            return [*parts[: i + 1], ".".join(parts[i + 1 :])]
     names = list(root.children.get("arms", root).children)
     for name in names if parts[0] == "arms" else []:
         words = name.split(".")
@@ -251,55 +354,80 @@ def _target(root: Node, key: str) -> list[str]:
     return parts
 
 
-def _nested(parts: Sequence[str], node: Node) -> Node:
-    for i in reversed(range(len(parts))):
-        node = Node({parts[i]: node}, node.place, node.place, ".".join(parts[:i]))
-    return node
-
-
 # Layers to settings
 
 
-class _Settings(NamedTuple):
-    base: Setting | None
-    arms: dict[str, Setting]
-    faults: list[Fault]
-
-
-def _normal(root: Node) -> Node:
+def _normal(root: Node, counts: Sequence[str]) -> Node:
     """One form for what may be written shortly: a number for all profiles, an arm with nothing in it."""
     children = dict(root.children)
-    for name in ("seeds", "steps"):
+    for name in counts:
         node = children.get(name)
         if node is not None and not isinstance(node.value, dict):
             children[name] = node._replace(value=dict.fromkeys(PROFILES, node))
-    for name in ("arms", "profiles"):
+    for name in ("arms", "profiles", "variants"):
         if name in children and children[name].children:
             filled = {k: v._replace(value={}) if v.value is None else v for k, v in children[name].children.items()}
             children[name] = children[name]._replace(value=filled)
     return root._replace(value=children)
 
 
-def _settings(root: Node, profile: str, patches: Sequence[Node]) -> _Settings:
+def _settings(root: Node, profile: str, variant: str | None, patches: Sequence[Node]) -> Resolved:
     """Resolve the base and every arm for a profile. Overrides of the base go before what the profile changes in it."""
-    layers = [root.children.get("base"), _child(_child(root, "profiles"), profile)]
-    layers += [_child(patch, "base") for patch in patches]
+    chosen = _child(_child(root, "profiles"), profile)
+    layers = [root.children.get("base"), chosen, *(_child(patch, "base") for patch in patches)]
     stated = [layer for layer in layers if layer is not None and isinstance(layer.value, dict)]
     common = [reduce(merge, stated)] if stated else []
+    last = [layer for layer in [_child(_child(root, "variants"), variant or "")] if layer]
     steps = _child(_child(root, "steps"), profile)
-    base, found = _setting(common, steps)
-    faults, arms = list(found), dict[str, Setting]()
+    base, faults = _setting([*common, *last] if common else [], steps)
+    planned, found = _planned(root, chosen)
+    faults += found + [fault for layer in last for fault in _unstated(common[0] if common else None, layer)]
+    arms: dict[str, Setting] = {}
     owners: dict[Fault, list[str]] = {}
-    for name, arm in (_child(root, "arms") or root._replace(value={})).children.items():
-        faults += _name_faults(name, arm) + _unstated(common[0] if common else None, arm)
-        setting, found = _setting([*common, arm], steps)
+    for name, (written, arm) in planned.items():
+        faults += _unstated(common[0] if common else None, arm)
+        setting, found = _setting([*common, arm, *last], steps)
         for fault in set(found) - set(faults):
-            owners.setdefault(fault, []).append(name)
+            owners.setdefault(fault, []).append(written)
         if setting is not None:
-            faults += _twin(setting, arms, arm, name)
+            faults += _twin(setting, arms, arm, name, variant)
             arms[name] = setting
-    faults += [_owned(fault, names) for fault, names in owners.items()]
-    return _Settings(base, arms, faults)
+    plain = ("arms.",) if _group(root, "arms") else ("arms.", "grid.")
+    faults += [f if f.path.startswith(plain) else _owned(f, names) for f, names in owners.items()]
+    kept, found = _kept(root, chosen)
+    arms = {name: arm for name, arm in arms.items() if kept is None or planned[name][0] in kept}
+    return Resolved(base, arms, faults + found)
+
+
+def _planned(root: Node, profile: Node | None) -> tuple[dict[str, tuple[str, Node]], list[Fault]]:
+    """Every arm of a profile at every point of its grid, by name: the arm as written, and all that it states."""
+    arms = _group(root, "arms")
+    faults = [fault for name, arm in arms.items() for fault in _name_faults(name, arm)]
+    grid, found = replaced(_child(root, "grid"), _child(profile, "grid"))
+    combined, more = points(grid, FIELDS, len(arms))
+    return _crossed(arms, combined), faults + found + more
+
+
+def _crossed(arms: Mapping[str, Node], combined: Sequence[Point]) -> dict[str, tuple[str, Node]]:
+    if not arms or not combined:
+        return {name: (name, arm) for name, arm in [*arms.items(), *combined]}
+    return {f"{name}, {p.name}": (name, merge(arm, p.layer)) for name, arm in arms.items() for p in combined}
+
+
+def _kept(root: Node, profile: Node | None) -> tuple[set[str] | None, list[Fault]]:
+    """The arms, as written, that a profile is content with; None for all."""
+    wanted, arms = _child(profile, "arms"), _group(root, "arms")
+    if wanted is None or not isinstance(wanted.value, list):
+        return None, []
+    names = [one for one in wanted.value if isinstance(one.value, str)]
+    faults = [Fault(n.place, n.path, f"{show(n.value)} is no arm; {choices(n.value, arms)}") for n in names]
+    return {str(n.value) for n in names}, [f for n, f in zip(names, faults, strict=True) if n.value not in arms]
+
+
+def _group(root: Node, key: str) -> dict[str, Node]:
+    """The arms, or the variants, as written."""
+    group = _child(root, key)
+    return group.children if group else {}
 
 
 def _setting(layers: Sequence[Node], steps: Node | None) -> tuple[Setting | None, list[Fault]]:
@@ -372,11 +500,32 @@ def _no_profile(profile: str) -> Fault:
     return Fault(Place("--profile"), "", f"{show(profile)} is not allowed; {choices(profile, PROFILES)}")
 
 
-def _no_mapping(path: Path, root: Node | None) -> Fault:
+def _plain(name: str) -> bool:
+    """Whether a name may be part of a file's."""
+    return name.replace("_", "").replace("-", "").isalnum()
+
+
+def _variant_faults(variants: Mapping[str, Node], wanted: str | None) -> list[Fault]:
+    text = "a variant is named with letters, digits, '-' and '_' only"
+    faults = [Fault(node.key, node.path, text) for name, node in variants.items() if not _plain(name)]
+    if wanted is not None and wanted not in variants:
+        allowed = choices(wanted, variants) if variants else "this study has no variants"
+        faults.append(Fault(Place("--variant"), "", f"{show(wanted)} is not allowed; {allowed}"))
+    return faults
+
+
+def _no_mapping(path: Path, root: Node | None, model: type[BaseModel]) -> Fault:
     if root is None or root.value is None:
-        return Fault(Place(str(path), 1, 1), "", f"empty; a study has {', '.join(File.model_fields)}")
-    text = f"{show(root.value)} is not a study; must be a mapping with {', '.join(File.model_fields)}"
+        return Fault(Place(str(path), 1, 1), "", f"empty; a study has {', '.join(model.model_fields)}")
+    text = f"{show(root.value)} is not a study; must be a mapping with {', '.join(model.model_fields)}"
     return Fault(root.place, "", text)
+
+
+def _no_study(root: Node) -> list[Fault]:
+    """Say this alone where a search was given."""
+    if not any("space" in arm.children for arm in _group(root, "arms").values()):
+        return []
+    return [Fault(Place(root.place.source, 1, 1), "", "an arm has a space: a search, for `rhmc search`, is no study")]
 
 
 def _no_value(root: Node, name: str, profile: str) -> list[Fault]:
@@ -409,13 +558,14 @@ def _unstated(base: Node | None, arm: Node) -> list[Fault]:
     return faults
 
 
-def _twin(setting: Setting, arms: dict[str, Setting], arm: Node, name: str) -> list[Fault]:
+def _twin(setting: Setting, arms: dict[str, Setting], arm: Node, name: str, variant: str | None) -> list[Fault]:
     same = [other for other, there in arms.items() if there == setting]
-    return [Fault(arm.key, arm.path, f"arm {show(name)} {TWIN} {show(other)}") for other in same[:1]]
+    where = f" in variant {show(variant)}" if variant else ""
+    return [Fault(arm.key, arm.path, f"arm {show(name)} {TWIN} {show(other)}{where}") for other in same[:1]]
 
 
 def _owned(fault: Fault, arms: Sequence[str]) -> Fault:
-    """Name the arms in which a fault shows, where its place does not."""
-    if fault.path.startswith("arms."):
-        return fault
-    return fault._replace(text=f"{fault.text} (in arm {', '.join(show(name) for name in arms)})")
+    """Name the arms in which a fault shows, as its place does not."""
+    names = list(dict.fromkeys(arms))
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return fault._replace(text=f"{fault.text} (in arm {', '.join(show(name) for name in names[:NAMED])}{more})")

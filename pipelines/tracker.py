@@ -34,11 +34,17 @@ class Card(NamedTuple):
     task: str
     commit: str
     params: dict[str, str]  # what varies between the runs of the study, and the seed
+    trial: int | None = None  # of a search: then the run stands for all of its seeds
 
     @property
     def key(self) -> str:
         """What was trained: spec id and fingerprint."""
         return f"{self.spec_id}-{self.fingerprint}"
+
+    @property
+    def name(self) -> str:
+        """What a person calls it."""
+        return f"{self.arm} s{self.seed}" if self.trial is None else f"{self.arm} t{self.trial}"
 
 
 class Recorded(NamedTuple):
@@ -110,6 +116,10 @@ class Tracker(Protocol):
         """Write a file that a run keeps to a folder; None if it keeps none of that name."""
         ...
 
+    def keep(self, path: Path) -> None:
+        """Keep a copy of a file with the study itself, in place of one of that name."""
+        ...
+
     def close(self, status: Status) -> None:
         """End the present launch. Runs left running become `interrupted`."""
         ...
@@ -175,6 +185,7 @@ class MemoryTracker:
     def __init__(self, study: StudyCard, shelf: list[MemoryRun]) -> None:
         self.study, self.shelf = study, shelf
         self.names = count(len(shelf))
+        self.kept: dict[str, bytes] = {}
         self._interrupt_running()
 
     def _mine(self) -> list[MemoryRun]:
@@ -215,6 +226,10 @@ class MemoryTracker:
             return None
         (folder / name).write_bytes(run.files[name])
         return folder / name
+
+    def keep(self, path: Path) -> None:
+        """See `Tracker`."""
+        self.kept[path.name] = path.read_bytes()
 
     def close(self, status: Status) -> None:
         """See `Tracker`."""

@@ -11,6 +11,7 @@ from typing import Any, TypedDict
 from filelock import FileLock, Timeout
 from ray.tune import Trainable
 
+from pipelines.seeds import Seeds
 from pipelines.store import Checkpoints, StoreError, save_atomically, without_replay
 from pipelines.study import RunSpec
 from rhmc.trainer import Trainer
@@ -43,7 +44,7 @@ class RunTrainable(Trainable):
         self.stop_file = Path(job["stop"])
         self.checkpoints = Checkpoints(Path(job["folder"]))
         self.lock = FileLock(f"{job['folder']}.lock")
-        self.trainer: Trainer | None = None
+        self.trainer: Trainer | Seeds | None = None
         self.history: list[Metrics] = []
         self.seconds = 0.0
         self.reported = self.saved = 0  # points told to the driver; points in the newest checkpoint
@@ -56,10 +57,14 @@ class RunTrainable(Trainable):
             self.lock.acquire(timeout=PATIENCE)
         except Timeout as error:
             raise StoreError(f"{self.job['folder']}: another process is training this run") from error
-        spec = RunSpec.model_validate_json(self.job["spec"])
-        self.trainer = Trainer(spec.env, spec.algo, spec.trainer, spec.seed)
+        self.trainer = self.make_trainer()
         if state := self.checkpoints.newest():
             self.load_state(state)
+
+    def make_trainer(self) -> Trainer | Seeds:
+        """What the job asks for, untrained."""
+        spec = RunSpec.model_validate_json(self.job["spec"])
+        return Trainer(spec.env, spec.algo, spec.trainer, spec.seed)
 
     def step(self) -> dict[str, Any]:
         """Train to the next point."""
@@ -73,7 +78,7 @@ class RunTrainable(Trainable):
         points, self.reported = self.history[self.reported :], len(self.history)
         return {"done": done or stopped, "stopped": stopped and not done, "points": points, "seconds": self.seconds}
 
-    def _advance(self, trainer: Trainer) -> None:
+    def _advance(self, trainer: Trainer | Seeds) -> None:
         start, before = time.perf_counter(), trainer.step
         metrics = next(trainer)
         spent = time.perf_counter() - start

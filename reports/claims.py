@@ -213,19 +213,19 @@ def c6(see: Evidence) -> Finding:
 
 
 def c7(see: Evidence) -> Finding:
-    """By number of sensors, in study `sensors`: RHMC is above every other method at each number (best), and its mean
+    """By number of sensors, in study `scaling`: RHMC is above every other method at each number (best), and its mean
     never falls by more than 5 points when sensors are added (stable). reproduced: both. partly: one. not reproduced:
     neither. untestable: the study has no runs."""
-    study = "sensors"
+    study = "scaling"
     groups = see.results.by_agents(study)
     if len(groups) < 2:
-        raise UntestableError("Study sensors has no results for several numbers of sensors.")
+        raise UntestableError("Study scaling has no results for several numbers of sensors.")
     best, means = [], []
     for arms in groups.values():
         ours = see.finals(study, arms["rhmc"]) if "rhmc" in arms else None
         others = [arm for kind, arm in arms.items() if kind != "rhmc"]
         if ours is None or not others:
-            raise UntestableError("Study sensors lacks RHMC or every other method at some number of sensors.")
+            raise UntestableError("Study scaling lacks RHMC or every other method at some number of sensors.")
         best += [difference(ours, see.finals(study, arm)).above(0) for arm in others]
         means.append(interval(ours))
     stable = bool(np.all(np.diff([x.value for x in means]) >= -NEAR))

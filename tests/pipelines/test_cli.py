@@ -2,9 +2,11 @@
 
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,8 +14,12 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 import pytest
+from typer.main import get_command
 
 from pipelines import cli
+from pipelines.commands import ui
+from pipelines.commands.doctor import MARK
+from pipelines.doctor import Finding
 from pipelines.fingerprint import fingerprint
 
 ROOT = Path(__file__).parents[2]
@@ -75,11 +81,50 @@ def test_reading_a_study_needs_no_ray_and_no_mlflow() -> None:
     assert imported({"ray", "mlflow", "pandas"}, words)[-1] == "[]"
 
 
-@pytest.mark.parametrize("words", [[], ["study"], ["yardsticks"], ["study", "run"], ["ui"], ["export"], ["report"]])
+VERBS = [
+    *([], ["study"], ["study", "run"], ["study", "export"], ["study", "import"], ["yardsticks"], ["evaluate"]),
+    *(["search"], ["search", "check"], ["search", "run"], ["search", "status"]),
+    *(["export"], ["report"], ["ui"], ["doctor"]),
+]
+
+
+@pytest.mark.parametrize("words", VERBS)
 def test_every_verb_explains_itself(rhmc: Rhmc, words: list[str]) -> None:
     said = rhmc(*words, "--help")
     assert (said.code, said.err) == (0, "")
     assert "Usage: rhmc" in said.out
+
+
+def test_help_ends_with_the_exit_codes(rhmc: Rhmc) -> None:
+    said = " ".join(rhmc("--help").out.split())
+    assert said.endswith("130 interrupted. Results are kept in $RHMC_HOME, or in the folder work.")
+    page = (ROOT / "docs/cli.md").read_text()
+    assert all(f"| {code} |" in page for code in (0, 1, 2, 130))
+
+
+def test_the_page_of_the_command_line_names_every_verb() -> None:
+    page = (ROOT / "docs/cli.md").read_text()
+    group = get_command(cli.app)
+    verbs = [name for name, one in group.commands.items() if not hasattr(one, "commands")]
+    verbs += [f"{name} {verb}" for name, one in group.commands.items() for verb in getattr(one, "commands", ())]
+    assert [verb for verb in verbs if verb not in page and verb != "yardsticks navigation"] == []
+
+
+@pytest.mark.parametrize(
+    ("line", "offered"),
+    [
+        ("rhmc st", {"study"}),
+        ("rhmc study ", {"check", "run", "status", "list", "export", "import"}),
+        ("rhmc study run studies/al", {"studies/alpha.yaml"}),
+        ("rhmc study run studies/alpha.yaml --profile q", {"quick"}),
+        ("rhmc search run studies/", {"studies/search_rhmc.yaml"}),
+    ],
+)
+def test_the_shell_completes(line: str, offered: set[str]) -> None:
+    words = {"COMP_WORDS": line, "COMP_CWORD": str(line.count(" ")), "_RHMC_COMPLETE": "complete_bash"}
+    command = [sys.executable, "-m", "pipelines.cli"]
+    done = subprocess.run(command, env=os.environ | words, capture_output=True, text=True, cwd=ROOT, check=False)
+    assert set(done.stdout.split()) == offered
 
 
 # Studies
@@ -139,6 +184,69 @@ def test_list_shows_questions_and_what_cannot_be_read(rhmc: Rhmc) -> None:
     assert [line[0] for line in lines] == ["studies/bad.yaml", "studies/x.yaml"]
     assert "not YAML" in lines[0][1]
     assert lines[1][1].strip() == "Which?"
+
+
+def test_list_leaves_searches_out(rhmc: Rhmc) -> None:
+    Path("studies/search_x.yaml").write_text("question: Which?\narms: {full: {space: {lr: {low: 1, high: 2}}}}\n")
+    assert [one["study"] for one in json.loads(rhmc("study", "list", "--json").out)] == ["studies/x.yaml"]
+
+
+def test_list_for_scripts(rhmc: Rhmc) -> None:
+    Path("studies/bad.yaml").write_text("a: [")
+    Path("studies/two.yaml").write_text(STUDY + "variants: {letter: {algo: {encoder: mlp}}}\n")
+    bad, two, plain = json.loads(rhmc("study", "list", "--json").out)
+    assert (bad["study"], bad["question"], "not YAML" in bad["fault"]) == ("studies/bad.yaml", "", True)
+    assert (two["variants"], plain["variants"], plain["fault"]) == (["letter"], [], "")
+
+
+def test_status_for_scripts(rhmc: Rhmc) -> None:
+    said = rhmc("study", "status", "studies/x.yaml", "--json")
+    none = {"planned": 2, "finished": 0, "running": 0, "interrupted": 0, "failed": 0, "missing": 2, "stale": 0}
+    assert (said.code, said.err) == (1, "")
+    expected = {"study": "x", "profile": "quick", "finished": False, "arms": {"full": none, "none": none}}
+    assert json.loads(said.out) == expected
+
+
+def test_every_verb_of_studies_takes_a_variant(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("studies/x.yaml").write_text(STUDY + "variants: {large: {algo: {hidden: 128}}}\n")
+    names: list[str] = []
+    for place in ("run.run_study", "run.show_status", "export.export_study"):
+        monkeypatch.setattr(f"pipelines.{place}", lambda study, *a, **k: names.append(study.name) or 0)
+    for verb in (["study", "run"], ["study", "status"], ["export"]):
+        rhmc(*verb, "studies/x.yaml", "--variant", "large")
+    assert names == ["x@large"] * 3
+    assert "x@large (quick)" in rhmc("study", "check", "studies/x.yaml", "--variant", "large").out
+    said = "--variant: 'larg' is not allowed; allowed: large; did you mean 'large'?\n"
+    assert rhmc("study", "check", "studies/x.yaml", "--variant", "larg") == (2, "", said)
+
+
+def test_what_travels_is_refused_in_one_line(rhmc: Rhmc, tmp_path: Path) -> None:
+    said = rhmc("study", "export", "studies/x.yaml", "b.zip")
+    assert said == (2, "", "x (quick): no run is finished or under way; nothing to export\n")
+    said = rhmc("study", "import", "b.zip")
+    assert (said.code, said.out, said.err.count("\n")) == (2, "", 1)
+    assert said.err.startswith("b.zip: not a bundle of `rhmc study export`")
+    assert not (tmp_path / "work").exists()
+
+
+def test_evaluate_without_a_policy(rhmc: Rhmc) -> None:
+    said = rhmc("evaluate", "studies/x.yaml")
+    assert said == (2, "", "x (quick): no such run has a policy yet; `rhmc study run` trains it\n")
+    assert rhmc("evaluate", "studies/x.yaml", "--arm", "ful").err.endswith("did you mean 'full'?\n")
+    assert (
+        rhmc("evaluate", "p.pt").err == "config.yaml: no such file; --config names the config.yaml that the run keeps\n"
+    )
+
+
+@pytest.mark.parametrize("level", ["ok", "note", "fault"])
+def test_the_doctor_answers_with_lines_and_an_exit_code(
+    rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch, level: str
+) -> None:
+    given = Finding(level, "disk", "text")
+    monkeypatch.setattr("pipelines.doctor.examine", lambda home, *, ray: iter([given] * (2 - ray)))
+    assert rhmc("doctor").code == (level == "fault")
+    assert rhmc("doctor", "--no-ray").out.splitlines() == [f"{MARK[level]}  disk: text"] * 2
+    assert json.loads(rhmc("doctor", "--json").out) == [{"level": level, "what": "disk", "text": "text"}]
 
 
 @pytest.mark.parametrize("code", [0, 1, 2, 130])
@@ -310,17 +418,17 @@ def test_ui_of_a_server_elsewhere_is_its_address(rhmc: Rhmc, monkeypatch: pytest
 
 
 class Server:
-    """Stands for the server's process."""
+    """Stands for the server's process: interrupted while it is waited for, then it ends."""
 
     given: tuple[list[str], dict[str, str]]
+    pid = 4711
 
-    def __init__(self, command: list[str], env: dict[str, str]) -> None:
+    def __init__(self, command: list[str], env: dict[str, str], *, start_new_session: bool) -> None:
+        assert start_new_session
         Server.given = command, env
-        self.waits = 0
 
-    def wait(self) -> int:
-        self.waits += 1
-        if self.waits == 1:
+    def wait(self, timeout: float | None = None) -> int:
+        if timeout is None:
             raise KeyboardInterrupt
         return -2
 
@@ -339,8 +447,12 @@ def test_ui_serves_the_store_on_this_machine_only_until_ctrl_c(
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    monkeypatch.setattr(cli, "subprocess", SimpleNamespace(Popen=Server))
+    killed: list[tuple[int, int]] = []
+    monkeypatch.setattr(ui, "subprocess", SimpleNamespace(Popen=Server))
+    monkeypatch.setattr(ui.os, "killpg", lambda *given: killed.append(given))
+    monkeypatch.setattr(ui.signal, "signal", lambda *given: None)
     said = rhmc("ui", "--port", str(port))
+    assert killed == [(Server.pid, signal.SIGTERM)]
     command, env = Server.given
     assert said.code == 0
     assert said.out.startswith(f"http://127.0.0.1:{port}/#/experiments?workflowType=machine_learning ")
@@ -351,8 +463,28 @@ def test_ui_serves_the_store_on_this_machine_only_until_ctrl_c(
     assert env["MLFLOW_DISABLE_TELEMETRY"] == "true"
 
 
+def test_sigterm_ends_the_server_and_its_workers(tmp_path: Path) -> None:
+    file = tmp_path / "pid"
+    code = (
+        "import sys, subprocess; from pathlib import Path; from pipelines.commands import ui\n"
+        "real = subprocess.Popen\n"
+        f"server = ['sh', '-c', 'sleep 600 & echo $! > {file}.part; mv {file}.part {file}; wait']\n"
+        "ui.subprocess.Popen = lambda command, **options: real(server, **options)\n"
+        "ui._serve('sqlite:///x', Path('.'), 1, [])\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.DEVNULL)
+    while not file.exists():
+        assert process.poll() is None
+        time.sleep(0.02)
+    worker = int(file.read_text())
+    process.terminate()
+    assert process.wait(60) == 0
+    state = Path(f"/proc/{worker}/stat")
+    assert not state.exists() or state.read_text().split()[2] == "Z"
+
+
 def test_ui_on_a_port_that_is_taken(rhmc: Rhmc, store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cli, "subprocess", None)
+    monkeypatch.setattr(ui, "subprocess", None)
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()

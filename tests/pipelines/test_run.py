@@ -22,7 +22,7 @@ from pipelines.progress import LiveBoard, PlainBoard, duration
 from pipelines.ray_driver import _knock
 from pipelines.recorder import Recorder
 from pipelines.run import _arguments, run_study, show_status
-from pipelines.store import Home, StoreError
+from pipelines.store import Checkpoints, Home, StoreError
 from pipelines.study import Study
 from pipelines.tracker import MemoryRun, MemoryTracker, StudyCard, points_of
 from rhmc.algorithms import iql
@@ -46,7 +46,7 @@ def launch(shelf: list[MemoryRun], tmp_path: Path) -> Launch:
     """A recorder as a new launch makes it."""
 
     def begin(runs: list[Item] | None = None, study: StudyCard = STUDY) -> Recorder:
-        tracker, board = MemoryTracker(study, shelf), PlainBoard(Console(file=io.StringIO()))
+        tracker, board = MemoryTracker(study, shelf), PlainBoard(Console(file=io.StringIO(), width=200))
         return Recorder(study, plan() if runs is None else runs, tracker, Home(tmp_path), board)
 
     return begin
@@ -103,6 +103,43 @@ def test_a_stopped_run_waits_for_the_next_launch(launch: Launch, shelf: list[Mem
     finish(again, key)
     assert len(shelf) == 1
     assert points_of(shelf[0].values) == POINTS
+
+
+def test_a_continued_run_says_at_which_step(launch: Launch) -> None:
+    recorder = launch()
+    first, second = (item.key for item in recorder.todo())
+    Checkpoints(recorder.home.checkpoints(first)).save(3, {})
+    step(recorder, first)
+    step(recorder, second)
+    said = recorder.board.console.file.getvalue().splitlines()
+    assert said == ["tiny / slow s0: continues at step 400 of 600", "tiny / fast s0: started"]
+
+
+def test_more_seeds_and_more_arms_train_only_what_is_new(launch: Launch, shelf: list[MemoryRun]) -> None:
+    recorder = launch()
+    for item in recorder.todo():
+        step(recorder, item.key)
+        finish(recorder, item.key)
+    arms = {"slow": setting(lr=1e-4), "fast": setting(lr=1e-2), "faster": setting(lr=1e-1)}
+    more = launch(plan(tiny(arms=arms).model_copy(update={"seeds": 2})))
+    more.reuse()
+    assert more.skipped == 2
+    names = [(item.card.arm, item.card.seed) for item in more.todo()]
+    assert names == [("slow", 1), ("fast", 1), ("faster", 0), ("faster", 1)]
+    renamed = launch(plan(tiny(arms={"crawling": arms["slow"]})))
+    renamed.reuse()
+    assert (renamed.left, shelf[-1].card.arm, shelf[-1].status) == (0, "crawling", "finished")
+
+
+def test_a_variant_shares_with_the_study_what_is_the_same_run(launch: Launch) -> None:
+    recorder = launch()
+    for item in recorder.todo():
+        step(recorder, item.key)
+        finish(recorder, item.key)
+    variant = tiny("tiny@other", arms={"slow": setting(lr=1e-4), "new": setting(lr=1.0)})
+    again = launch(plan(variant), study_card(variant))
+    again.reuse()
+    assert [item.card.arm for item in again.todo()] == ["new"]
 
 
 def test_a_failure_is_kept_and_tried_again(launch: Launch, shelf: list[MemoryRun]) -> None:
@@ -342,11 +379,42 @@ def test_a_log_that_fails_stops_the_study(
     assert {run.status for run in tracker.recorded()} == {"interrupted"}
 
 
+@pytest.mark.ray
+def test_a_run_that_is_stopped_before_it_begins_has_not_failed(
+    home: Path, cluster: None, launch: Launch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As when Ctrl-C comes while Ray still makes the worker."""
+    from pipelines.ray_driver import Bridge, fit
+
+    monkeypatch.setattr(Bridge, "over", property(lambda self: self.error is not None))
+    recorder, stop = launch(), home / "stop"
+    stop.touch()
+    jobs = [
+        {
+            "key": i.key,
+            "spec": i.spec.canonical(),
+            "folder": str(home / i.key),
+            "checkpoint_every": 1,
+            "stop": str(stop),
+        }
+        for i in recorder.todo()
+    ]
+    fit(jobs, recorder, home / "scratch", 1, 1, stop)
+    assert recorder.failures == {}
+    assert recorder.left == 2
+    assert not list(home.rglob("*.pt"))
+
+
 def test_a_setting_that_one_method_lacks_does_not_vary_for_that() -> None:
     specs = [run.spec for run in Study.load(STUDIES / "ablation.yaml").runs()]
     varying = what_varies(specs)
     assert {"algo.kind", "algo.regulator", "algo.filter", "seed"} <= set(varying)
     assert "algo.alpha" not in varying
+
+
+def test_the_next_command_names_the_variant() -> None:
+    study = Study.load(STUDIES / "ablation.yaml", "quick", ["seeds=1"], "letter")
+    assert _arguments(study) == f"{STUDIES / 'ablation.yaml'} --profile quick --variant letter --set seeds=1"
 
 
 def test_the_next_command_names_the_file_and_the_changes() -> None:

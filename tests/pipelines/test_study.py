@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from pipelines.document import Node, Place, merge, plain
 from pipelines.study import PROFILES, RunSpec, Study, StudyError, changes
+from rhmc.algorithms import ALGORITHMS
 
 GOOD = """\
 question: Which?
@@ -107,7 +108,10 @@ def test_a_byte_order_mark_and_an_arm_with_nothing_in_it() -> None:
     assert changes(Study.load("studies/x.yaml").base, Study.load("studies/x.yaml").arms["full"]) == {}
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "studies").glob("*.yaml")), ids=lambda p: p.stem)
+STUDIES = [p for p in sorted((ROOT / "studies").glob("*.yaml")) if not p.stem.startswith("search_")]
+
+
+@pytest.mark.parametrize("path", STUDIES, ids=lambda p: p.stem)
 @pytest.mark.parametrize("profile", PROFILES)
 def test_the_studies_at_hand(path: Path, profile: str) -> None:
     study = Study.load(path, profile)
@@ -115,11 +119,47 @@ def test_the_studies_at_hand(path: Path, profile: str) -> None:
     assert study.runs()
 
 
-@pytest.mark.parametrize("name", ["ablation", "coverage", "navigation"])
+@pytest.mark.parametrize("name", ["ablation", "coverage", "navigation", "scaling"])
 def test_methods_are_compared_on_one_task_and_one_encoder(name: str) -> None:
-    study = Study.load(ROOT / "studies" / f"{name}.yaml")
+    study = Study.load(ROOT / "studies" / f"{name}.yaml", "paper")
     assert {setting.algo.encoder for setting in study.arms.values()} == {"pairwise"}
-    assert len({setting.env for setting in study.arms.values()}) == 1
+    tasks = {setting.env.model_copy(update={"agents": 1}) for setting in study.arms.values()}
+    assert len(tasks) == 1
+    assert {task.observation for task in tasks} == {"extended"}
+
+
+@pytest.mark.parametrize("name", ["ablation", "navigation", "scaling"])
+def test_to_the_letter_every_method_has_the_papers_encoder_and_observation(name: str) -> None:
+    path = ROOT / "studies" / f"{name}.yaml"
+    study, strong = (Study.load(path, "paper", variant=variant) for variant in ("letter", None))
+    assert {(a.algo.encoder, a.env.observation) for a in study.arms.values()} == {("mlp", "paper")}
+    assert (study.name, strong.name) == (f"{name}@letter", name)
+    for arm, setting in strong.arms.items():
+        assert set(changes(setting, study.arms[arm])) == {"algo.encoder", "env.observation"}
+
+
+@pytest.mark.parametrize("name", ["navigation", "scaling"])
+def test_all_methods_are_there(name: str) -> None:
+    study = Study.load(ROOT / "studies" / f"{name}.yaml", "paper")
+    by_size: dict[int, list[str]] = {}
+    for arm in study.arms.values():
+        by_size.setdefault(arm.env.agents, []).append(arm.algo.kind)
+    assert sorted(by_size) == {"navigation": [3], "scaling": [2, 3, 4, 5, 6]}[name]
+    assert all(sorted(kinds) == sorted(ALGORITHMS) for kinds in by_size.values())
+
+
+def test_the_sweeps_share_what_the_coverage_study_has_trained() -> None:
+    shared = {}
+    ids = {run.spec.id for run in Study.load(ROOT / "studies/coverage.yaml", "paper").runs()}
+    for name in ("scaling", "alpha", "assignment_period", "encoder"):
+        runs = Study.load(ROOT / "studies" / f"{name}.yaml", "paper").runs()
+        shared[name] = sum(run.spec.id in ids for run in runs)
+    assert shared == {"scaling": 27, "alpha": 3, "assignment_period": 3, "encoder": 12}
+
+
+def test_the_template_is_short_without_its_comments() -> None:
+    lines = (ROOT / "studies/template.yaml").read_text().splitlines()
+    assert len([line for line in lines if line.partition("#")[0].strip()]) < 15
 
 
 # Overrides
@@ -184,11 +224,159 @@ def test_faulty_overrides_are_named_as_given(override: str, said: str) -> None:
     assert "..." in said or line == f"--set {override}: {said}"
 
 
+# Grids
+
+GRID = GOOD.replace("seeds:", "grid:\n  algo.lr: [1e-3, 5e-5]\n  env.agents: [2, 4]\nseeds:")
+ONLY_GRID = GRID.replace(ARMS, "")
+
+
+def test_a_grid_takes_every_arm_to_every_point() -> None:
+    arms = load(GRID).arms
+    points = ["lr=0.001, agents=2", "lr=0.001, agents=4", "lr=5e-05, agents=2", "lr=5e-05, agents=4"]
+    assert list(arms) == [f"{arm}, {point}" for arm in ("full", "none", "IQL") for point in points]
+    for name, arm in arms.items():
+        lr, agents = name.rpartition(", lr=")[2].split(", agents=")
+        assert (arm.algo.lr, arm.env.agents) == (float(lr), int(agents))
+        assert arm.algo.encoder == "pairwise"
+    assert arms["none, lr=0.001, agents=2"].algo.regulator == "none"
+
+
+def test_without_arms_the_base_goes_to_every_point() -> None:
+    study = load(ONLY_GRID)
+    assert list(study.arms)[:2] == ["lr=0.001, agents=2", "lr=0.001, agents=4"]
+    assert changes(study.base, study.arms["lr=5e-05, agents=2"]) == {"env.agents": 2, "algo.lr": 5e-5}
+
+
+def test_keys_that_end_alike_are_named_in_full_and_lists_by_their_place() -> None:
+    boxes = "[[0, 1, 0, 1], [2, 3, 2, 3]]"
+    text = ONLY_GRID.replace("algo.lr: [1e-3, 5e-5]", f"env.boxes: [{boxes}]").replace("agents: [2, 4]", "agents: [2]")
+    assert list(load(text).arms) == ["boxes=no. 1, agents=2"]
+    text = ONLY_GRID.replace(
+        "algo.lr: [1e-3, 5e-5]", "algo.kind: [rhmc]\n  env.kind: [coverage]\n  algo.encoder: [mlp]"
+    )
+    assert next(iter(load(text).arms)) == "algo.kind=rhmc, env.kind=coverage, encoder=mlp, agents=2"
+
+
+def test_a_grid_may_say_what_another_kind_does_not_inherit() -> None:
+    text = GRID.replace("iql, encoder: pairwise", "iql").replace("algo.lr: [1e-3, 5e-5]", "algo.encoder: [mlp]")
+    assert {arm.algo.encoder for arm in load(text).arms.values()} == {"mlp"}
+
+
+def test_a_profile_is_content_with_some_arms_and_values() -> None:
+    text = GRID.replace("full: {}", "full: {}\n  full, too: {algo: {horizon: 2}}")
+    text += "profiles: {quick: {arms: [full, IQL], grid: {env.agents: [3]}}}"
+    assert list(load(text).arms) == [
+        f"{arm}, lr={lr}, agents=3" for arm in ("full", "IQL") for lr in ("0.001", "5e-05")
+    ]
+    assert len(load(text, "paper").arms) == 16
+    assert len(load(text, "paper", "profiles.paper.arms=[none]").arms) == 4
+    assert len(load(text, "quick", "profiles.quick.grid.env.agents=[2,3]", "grid.algo.lr=[1]").arms) == 4
+
+
+GRIDS = [
+    ("algo.lr: [", "algo.lrr: [", ["11:3: grid.algo.lrr: unknown key 'lrr'; ...'lr'? (in arm 'full', 'none')"]),
+    ("[1e-3, 5e-5]", "[1e-3, -1]", ["11:19: grid.algo.lr: -1 is not allowed; ... (in arm 'full', 'none', 'IQL')"]),
+    ("[1e-3, 5e-5]", "[1e-3, 0.001]", ["11:19: grid.algo.lr: 0.001 is there twice"]),
+    ("[1e-3, 5e-5]", "[1e-3, a/b]", ["11:19: grid.algo.lr: 'a/b' cannot be part of an arm's name"]),
+    ("[1e-3, 5e-5]", "1e-3", ["11:12: grid.algo.lr: 0.001 is not allowed; must be a valid list"]),
+    ("[1e-3, 5e-5]", "[]", ["11:12: grid.algo.lr: [] is not allowed; must not be empty"]),
+    ("[1e-3, 5e-5]", "[.nan]", ["11:13: grid.algo.lr.0: .nan is not allowed; must be a finite number"]),
+    ("algo.lr:", "lr:", ["11:3: grid.lr: 'lr' is no key of a run; ... did you mean 'algo.lr'?"]),
+    ("algo.lr:", "seeds:", ["11:3: grid.seeds: 'seeds' is no key of a run; a dotted name such as algo.alpha..."]),
+    ("algo.lr: [1e-3, 5e-5]", "trainer.steps: [1, 2]", ["11:3: grid.trainer.steps: ... 'none', 'IQL')"]),
+    ("env.agents: [2, 4]", "env.agents: [2, 9]", ["12:19: grid.env.agents: 9 sensors need as many ..."]),
+    ("steps: 1000", "steps: 9\nprofiles: {quick: {grid: {env.agent: [1]}}}",
+     ["15:27: profiles.quick.grid.env.agent: 'env.agent' is no key of the grid; did you mean 'env.agents'?"]),
+    ("steps: 1000", "steps: 9\nprofiles: {quick: {arms: [ful]}}",
+     ["15:27: profiles.quick.arms.0: 'ful' is no arm; allowed: full, none, IQL; did you mean 'full'?"]),
+    ("steps: 1000", "steps: 9\nprofiles: {quick: {arms: [[ful]]}}",
+     ['15:27: profiles.quick.arms.0: ["ful"] is not allowed; must be a valid string']),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("old", "new", "said"), GRIDS)
+def test_faulty_grids(old: str, new: str, said: list[str]) -> None:
+    assert GRID.count(old) == 1
+    assert_said([line for line in faults(GRID.replace(old, new)) if "(in arm 'IQL')" not in line], said)
+
+
+def test_a_grid_too_large_to_train_is_refused_before_it_is_spelled_out() -> None:
+    keys = "algo.lr", "algo.alpha", "algo.gamma_h", "algo.gamma_l", "algo.epsilon", "algo.flip", "algo.polyak"
+    values = ", ".join(f"0.{i}" for i in range(10, 90))
+    text = GRID.replace("  env.agents: [2, 4]\n", "").replace("  algo.lr: [1e-3, 5e-5]\n", "")
+    text = text.replace("grid:\n", "grid:\n" + "".join(f"  {key}: [{values}]\n" for key in keys))
+    assert faults(text) == ["studies/x.yaml:10:1: grid: 62,914,560,000,000 arms in all; at most 1,000"]
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.text(max_size=40), st.integers(0, len(GRID)), st.integers(0, 20))
+def test_whatever_is_written_into_a_grid_is_read_or_refused(text: str, at: int, cut: int) -> None:
+    Path("studies/x.yaml").write_bytes((GRID[:at] + text + GRID[at + cut :]).encode())
+    said = None
+    try:
+        assert Study.load("studies/x.yaml").runs()
+    except StudyError as error:
+        said = str(error)
+    assert said is None or all(line.startswith("studies/x.yaml") for line in said.splitlines())
+
+
+# Variants
+
+VARIANTS = (
+    GOOD + "variants:\n  letter: {env: {observation: paper}, algo: {encoder: mlp}}\n  long: {trainer: {num_envs: 8}}\n"
+)
+
+
+def test_a_variant_changes_every_arm_whatever_its_kind_and_has_a_name_of_its_own() -> None:
+    Path("studies/x.yaml").write_text(VARIANTS)
+    plain, letter, long = (Study.load("studies/x.yaml", variant=v) for v in (None, "letter", "long"))
+    assert [study.name for study in (plain, letter, long)] == ["x", "x@letter", "x@long"]
+    assert {run.study for run in letter.runs()} == {"x@letter"}
+    assert plain.runs() == load(GOOD).runs()
+    assert {(a.algo.encoder, a.env.observation) for a in letter.arms.values()} == {("mlp", "paper")}
+    assert [a.algo.kind for a in letter.arms.values()] == ["rhmc", "rhmc", "iql"]
+    assert letter.arms["none"].algo.regulator == "none"
+    assert changes(letter.base, letter.arms["none"]) == {"algo.regulator": "none"}
+    assert {a.trainer.num_envs for a in long.arms.values()} == {8}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("encoder: mlp", "encoder: mpl", ["13:55: variants.letter.algo.encoder: 'mpl' is not allowed; ... 'mlp'?"]),
+        ("letter: {env", "letter: {envs", ["13:12: variants.letter.envs: unknown key 'envs'; ... did you mean 'env'?"]),
+        ("long:", "a/b:", ["14:3: variants.a/b: a variant is named with letters, digits, '-' and '_' only"]),
+        (
+            "trainer: {num_envs: 8}",
+            "algo: {kind: iql}",
+            [
+                "14:16: variants.long.algo.encoder: missing; ... the base has 'pairwise': state it here",
+                "7:3: arms.none: arm 'none' is the same as arm 'full' in variant 'long'",
+            ],
+        ),
+    ],
+)  # fmt: skip
+def test_faulty_variants(old: str, new: str, said: list[str]) -> None:
+    assert VARIANTS.count(old) == 1
+    assert_said(sorted(faults(VARIANTS.replace(old, new))), sorted(said))
+
+
+def test_an_unknown_variant() -> None:
+    for text, said in [
+        (VARIANTS, "allowed: letter, long; did you mean 'letter'?"),
+        (GOOD, "this study has no variants"),
+    ]:
+        Path("studies/x.yaml").write_text(text)
+        with pytest.raises(StudyError) as caught:
+            Study.load("studies/x.yaml", variant="leter")
+        assert str(caught.value) == f"--variant: 'leter' is not allowed; {said}"
+
+
 # Faulty files. Each: what is written instead of what, and what is said, `...` for a long list in the middle.
 
 WHOLE = [
-    ("", "1:1: empty; a study has question, base, arms, seeds, steps, profiles, resources"),
-    ("# nothing\n", "1:1: empty; a study has question, base, arms, seeds, steps, profiles, resources"),
+    ("", "1:1: empty; a study has question, base, arms, grid, variants, seeds, steps, profiles, resources"),
+    ("# nothing\n", "1:1: empty; a study has question, base, arms, grid, variants, seeds, steps, profiles, resources"),
     ("- 1\n", "1:1: [1] is not a study; must be a mapping with ... steps, profiles, resources"),
     ("  hello\n", "1:3: 'hello' is not a study; must be a mapping with ... steps, profiles, resources"),
     ("question: [1,\n", "2:1: not YAML: expected the node content, ... (while parsing a flow node)"),

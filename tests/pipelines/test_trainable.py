@@ -10,7 +10,9 @@ import torch
 
 from pipelines.store import Checkpoints, StoreError, save_atomically, without_replay
 from pipelines.trainable import RunTrainable
-from tests.pipelines.support import spec
+from rhmc.algorithms import ALGORITHMS
+from rhmc.trainer import Trainer
+from tests.pipelines.support import setting, spec
 
 Start = Callable[..., RunTrainable]
 
@@ -109,6 +111,40 @@ def test_checkpoints_come_as_often_as_asked_and_at_the_end(start: Start, tmp_pat
         run.step()
         seen.append(sorted(file.name for file in (tmp_path / "a" / "run0").glob("*.pt")))
     assert seen == [[], [], ["00000003.pt"], ["00000003.pt", "00000004.pt", "policy.pt"]]
+
+
+def test_a_kept_policy_holds_nothing_that_learning_kept() -> None:
+    replay, rows = {"rows": {"a": torch.ones(2)}, "next": 0, "size": 2}, [{"a": torch.ones(2)}]
+    state = {"replay": replay, "rollout": {"rows": rows}, "net": {"rows.weight": torch.ones(1)}, "list": [replay]}
+    state["decisions"] = {"rows": {"a": torch.ones(3, 2)}, "count": torch.ones(2)}
+    kept = without_replay(state)
+    empty = {"rows": {}, "next": 0, "size": 0}
+    assert (kept["replay"], kept["list"], kept["rollout"]) == (empty, [empty], {"rows": []})
+    assert (kept["decisions"]["rows"], len(kept["decisions"]["count"])) == ({}, 0)
+    assert kept["net"] == state["net"]
+    assert len(state["rollout"]["rows"]) == 1
+
+
+@pytest.mark.parametrize("kind", ALGORITHMS)
+def test_no_method_keeps_its_half_rollout(kind: str) -> None:
+    """The policy of an untrained and of a trained run hold the same tensors but for the task's own state."""
+    config = {"kind": kind, "hidden": 8}
+    one = setting().model_copy(update={"algo": ALGORITHMS[kind].config.model_validate(config)})
+    trainer = Trainer(one.env, one.algo, one.trainer, 0)
+    next(trainer)
+    before = sizes(without_replay(trainer.state_dict()["algorithm"]))
+    for _ in range(3):
+        trainer._act()
+    after = sizes(without_replay(trainer.state_dict()["algorithm"]))
+    assert {path: size for path, size in after.items() if ".pending." not in path} == before
+
+
+def sizes(state: Any, path: str = "") -> dict[str, int]:
+    """Numbers in each tensor of a state."""
+    if isinstance(state, torch.Tensor):
+        return {path: state.numel()}
+    inner = state.items() if isinstance(state, dict) else enumerate(state) if isinstance(state, list) else ()
+    return {k: v for name, child in inner for k, v in sizes(child, f"{path}.{name}").items()}
 
 
 def test_the_policy_is_the_last_state_with_empty_replays(start: Start, tmp_path: Path) -> None:

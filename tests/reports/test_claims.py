@@ -139,7 +139,7 @@ def sensors(ours: Sequence[float], theirs: Sequence[float]) -> Tables:
     """RHMC and IQL at 2, 3, ... sensors."""
     parts = [
         study(
-            "sensors",
+            "scaling",
             {f"RHMC, {n}": noisy(x, 5), f"IQL, {n}": noisy(y, 5)},
             env=COVERAGE | {"agents": n},
             steps=PAPER,

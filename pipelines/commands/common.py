@@ -1,0 +1,100 @@
+"""What the verbs share: options, reading a study, printing. Imports nothing heavy."""
+
+import json
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pipelines.errors import InputError
+
+if TYPE_CHECKING:
+    from pipelines.study import Study
+
+DONE, UNFINISHED, BAD, INTERRUPTED = 0, 1, 2, 130  # exit codes
+WIDTH = 140  # columns of a table that is not shown on a terminal
+
+SET_HELP = (
+    "Change the study: KEY=VALUE, KEY a dotted path of its file, VALUE read as YAML (seeds=1, steps=1e5, "
+    "base.algo.lr=1e-3, arms.full.env.agents=6, grid.algo.alpha=[0,0.1]). env., algo. and trainer. stand for "
+    "base.env., base.algo. and base.trainer., and trainer.steps for steps. Merged as an arm is into the base. It goes "
+    "before what a profile changes; an arm keeps what it states itself. Can be given several times."
+)
+
+
+def files_in(folder: str, pattern: str, incomplete: str) -> list[str]:
+    """Completion of a file, in the folder where they usually are."""
+    return [str(p) for p in sorted(Path(folder).glob(pattern)) if str(p).startswith(incomplete)]
+
+
+def _studies(incomplete: str) -> list[str]:
+    return files_in("studies", "*.yaml", incomplete)
+
+
+def _profiles(incomplete: str) -> list[str]:
+    return [name for name in ("quick", "paper") if name.startswith(incomplete)]
+
+
+File = Annotated[
+    Path, typer.Argument(metavar="FILE", help="A study, such as studies/ablation.yaml.", autocompletion=_studies)
+]
+Profile = Annotated[str, typer.Option(help="The budget: quick or paper.", autocompletion=_profiles)]
+Variant = Annotated[str | None, typer.Option(help="One of the file's variants, which changes every arm.")]
+Sets = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help=SET_HELP)]
+Json = Annotated[bool, typer.Option("--json", help="JSON on stdout instead of a table.")]
+
+
+def load_study(file: Path, profile: str, overrides: Sequence[str] | None, variant: str | None) -> "Study":
+    """The study that the options name.
+
+    Raises:
+        InputError: with every fault.
+    """
+    from pipelines.study import Study
+
+    return Study.load(file, profile, overrides or [], variant)
+
+
+@contextmanager
+def folder_option(out: Path | None) -> Iterator[None]:
+    """Work with the folder that `--out` names, if any: what is wrong with it is bad input.
+
+    Raises:
+        InputError: it is a file, or cannot be written to.
+    """
+    from pipelines.store import StoreError
+
+    if out is not None and out.exists() and not out.is_dir():
+        raise InputError(f"--out: {out} is not a folder")
+    try:
+        yield
+    except StoreError as error:
+        raise InputError(str(error)) from error
+
+
+def say(text: str) -> None:
+    """A line on stdout, at once."""
+    print(text, flush=True)
+
+
+def say_json(value: Any) -> None:
+    """One JSON value on stdout, on a line of its own."""
+    print(json.dumps(value, ensure_ascii=False), flush=True)
+
+
+def table(columns: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[str] = ()) -> None:
+    """A table on stdout; `numbers` are the columns that stand to the right."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    drawn = Table(box=box.SIMPLE)
+    for column in columns:
+        drawn.add_column(column, justify="right" if column in numbers else "left", overflow="fold")
+    for row in rows:
+        drawn.add_row(*map(Text, row))
+    Console(width=None if sys.stdout.isatty() else WIDTH).print(drawn)

@@ -1,0 +1,134 @@
+"""`rhmc study`: check, run, follow and move studies; `rhmc export` for the report."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from pipelines.commands.common import File, Json, Profile, Sets, Variant, load_study, say, say_json, table
+from pipelines.errors import InputError
+
+app = typer.Typer(help="Check, run, follow and move studies.", no_args_is_help=True)
+
+
+@app.command("check")
+def check(file: File, profile: Profile = "quick", variant: Variant = None, overrides: Sets = None) -> None:
+    """Say what a study would run, or everything that is wrong with it. Starts nothing."""
+    from pipelines.study import changes
+
+    study = load_study(file, profile, overrides, variant)
+    rows = []
+    for arm, setting in study.arms.items():
+        differs = ", ".join(f"{key}={value}" for key, value in changes(study.base, setting).items()) or "the base"
+        rows.append([arm, differs, str(study.seeds), f"{study.steps:,}", str(setting.trainer.num_envs)])
+    say(f"{study.name} ({study.profile}): {study.question}")
+    table(["arm", "differs in", "seeds", "steps", "copies"], rows, numbers=("seeds", "steps", "copies"))
+    runs = len(study.arms) * study.seeds
+    say(f"{runs} runs, {runs * study.steps:,} environment steps in all, {study.resources.concurrent} runs at a time")
+
+
+@app.command("run")
+def run(file: File, profile: Profile = "quick", variant: Variant = None, overrides: Sets = None) -> None:
+    """Run what a study still lacks. Finished runs are skipped, interrupted ones continue."""
+    study = load_study(file, profile, overrides, variant)
+    from pipelines.run import run_study
+    from pipelines.store import work_folder
+
+    raise typer.Exit(run_study(study, work_folder()))
+
+
+@app.command("status")
+def status(
+    file: File, profile: Profile = "quick", variant: Variant = None, as_json: Json = False, overrides: Sets = None
+) -> None:
+    """Say how many runs are finished, under way, missing or stale (made by other code). Exit code 1 if any is left."""
+    study = load_study(file, profile, overrides, variant)
+    from pipelines.run import show_status
+    from pipelines.store import work_folder
+
+    raise typer.Exit(show_status(study, work_folder(), as_json=as_json))
+
+
+@app.command("list")
+def list_(
+    folder: Annotated[Path, typer.Option(help="Where the studies are.")] = Path("studies"), as_json: Json = False
+) -> None:
+    """List the studies of a folder with their questions and variants."""
+    files = sorted(folder.glob("*.yaml"))
+    if not files:
+        raise InputError(f"{folder}: no studies (*.yaml) here")
+    found = [one for file in files if (one := _listed(file))]
+    if as_json:
+        say_json(found)
+        return
+    rows = [[one["study"], one["question"] or one["fault"], ", ".join(one["variants"])] for one in found]
+    table(["study", "question", "variants"], rows)
+
+
+def _listed(file: Path) -> dict[str, Any] | None:
+    """What there is to say of a study; None for a search, which has a space in an arm."""
+    from pipelines.document import read
+
+    root, faults = read(file)
+    nodes = root.children if root else {}
+    if "arms" in nodes and any("space" in arm.children for arm in nodes["arms"].children.values()):
+        return None
+    question = str(nodes["question"].value) if "question" in nodes else ""
+    fault = "" if question else str(faults[0]) if faults else "no question"
+    variants = list(nodes["variants"].children) if "variants" in nodes else []
+    return {"study": str(file), "question": question, "variants": variants, "fault": fault}
+
+
+@app.command("export")
+def export_runs(
+    file: File,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="A new folder, or a new archive if it ends with .zip.")],
+    profile: Profile = "quick",
+    variant: Variant = None,
+    overrides: Sets = None,
+) -> None:
+    """Pack a study's finished runs, and the checkpoints of those under way, for another machine."""
+    study = load_study(file, profile, overrides, variant)
+    from pipelines.bundle import pack
+    from pipelines.store import StoreError, work_folder
+
+    try:
+        packed = pack(study, out, work_folder())
+    except StoreError as error:
+        raise InputError(str(error)) from error
+    say(f"{out}: {packed.finished} of {packed.planned} runs finished, {packed.begun} under way")
+    say(f"there:  rhmc study import {out.name}")
+
+
+@app.command("import")
+def import_runs(
+    bundle: Annotated[Path, typer.Argument(metavar="BUNDLE", help="What `rhmc study export` wrote.")],
+) -> None:
+    """Take in runs from another machine: `rhmc study run` then goes on from there."""
+    from pipelines.bundle import unpack
+    from pipelines.store import StoreError, work_folder
+
+    try:
+        taken = unpack(bundle, work_folder())
+    except StoreError as error:
+        raise InputError(str(error)) from error
+    say(
+        f"{taken.study} ({taken.profile}): {taken.new} finished runs taken in, {taken.known} were here before, "
+        f"{taken.begun} to be continued"
+    )
+    if taken.foreign:
+        say(f"made by other code ({taken.foreign}): with the code here these runs would be trained again")
+
+
+def export(
+    file: File,
+    profile: Profile = "quick",
+    variant: Variant = None,
+    out: Annotated[Path | None, typer.Option(help="Folder; reports/<profile>/runs if not given.")] = None,
+    overrides: Sets = None,
+) -> None:
+    """Write a study's results as one tidy table and a table of its runs, for the report."""
+    study = load_study(file, profile, overrides, variant)
+    from pipelines.export import export_study
+
+    raise typer.Exit(export_study(study, out or Path("reports") / profile / "runs"))

@@ -1,0 +1,121 @@
+"""`rhmc yardsticks`: scores of policies that need no learning."""
+
+import inspect
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from pipelines.commands.common import DONE, Json, folder_option, say_json, table
+from pipelines.errors import InputError
+
+app = typer.Typer(help="Score scripted policies and bounds.", no_args_is_help=True)
+
+Fields = dict[str, Any]
+
+
+def verb(name: str) -> Callable[[Callable[..., Fields]], Callable[..., None]]:
+    """Make a verb of a function from a task's options to its fields: the options of every bank are added to them."""
+
+    def of_task(fields: Callable[..., Fields]) -> Callable[..., None]:
+        own = inspect.signature(fields).parameters
+        shared = inspect.signature(_score).parameters
+
+        def call(**given: Any) -> None:
+            task = fields(**{option: given.pop(option) for option in own})
+            _score(name, task, **given)
+
+        options = [*own.values(), *(p for option, p in shared.items() if option not in ("kind", "fields"))]
+        call.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
+        call.__annotations__ = {option.name: option.annotation for option in options}
+        call.__doc__ = fields.__doc__
+        app.command(name)(call)
+        return call
+
+    return of_task
+
+
+def _score(
+    kind: str,
+    fields: Fields,
+    episodes: Annotated[int, typer.Option(min=2, help="Episodes of the bank.")] = 1000,
+    policies: Annotated[
+        str | None, typer.Option(help="Names with commas between; all but the planner if not given.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Names the bank of episodes.")] = 0,
+    as_json: Json = False,
+    out: Annotated[
+        Path | None, typer.Option(help="Also write yardsticks.parquet there, beside the runs' tables.")
+    ] = None,
+    profile: Annotated[str, typer.Option(help="The profile that --out is for.")] = "quick",
+) -> None:
+    import torch
+
+    from rhmc.yardsticks import yardsticks
+
+    env = _env(kind, fields)
+    chosen = None if policies is None else [name.strip() for name in policies.split(",")]
+    _check(kind, chosen or [], profile)
+    torch.set_num_threads(1)
+    with folder_option(out):
+        scores = yardsticks(env, chosen, episodes=episodes, seed=seed)
+        if out is not None:
+            from pipelines.yardsticks import export_yardsticks
+
+            written = export_yardsticks(env, scores, episodes=episodes, seed=seed, profile=profile, out=out)
+            print(f"wrote {written}", file=sys.stderr)
+    if as_json:
+        say_json(scores)
+        raise typer.Exit(DONE)
+    columns = list(dict.fromkeys(key for score in scores.values() for key in score))
+    rows = [[name, *(f"{score[key]:.2f}" if key in score else "" for key in columns)] for name, score in scores.items()]
+    table(["policy", *columns], rows, numbers=columns)
+
+
+def _check(kind: str, policies: list[str], profile: str) -> None:
+    from pipelines.document import choices
+    from pipelines.study import PROFILES
+    from rhmc.yardsticks import names
+
+    known = names(kind)
+    faults = [f"--policies: '{n}' is not allowed; {choices(n, known)}" for n in policies if n not in known]
+    if profile not in PROFILES:
+        faults.append(f"--profile: '{profile}' is not allowed; {choices(profile, PROFILES)}")
+    if faults:
+        raise InputError("\n".join(faults))
+
+
+def _env(kind: str, fields: Fields) -> Any:
+    """The task that options describe, their faults named as options."""
+    from pipelines.document import Node, Place, validate
+    from rhmc.envs import ENVS
+
+    def node(value: Any, name: str) -> Node:
+        return Node(value, Place(f"--{name}"), Place(f"--{name}"), "")
+
+    cfg, faults = validate(ENVS[kind][0], node({name: node(value, name) for name, value in fields.items()}, kind))
+    if cfg is None:
+        raise InputError("\n".join(str(fault) for fault in faults))
+    return cfg
+
+
+@verb("coverage")
+def coverage(
+    preset: Annotated[str, typer.Option(help="flat, executor or coordinator.")] = "flat",
+    agents: Annotated[int, typer.Option(help="Sensors.")] = 4,
+    targets: Annotated[int, typer.Option(help="Targets.")] = 5,
+) -> Fields:
+    """Coverage: the share of targets in view, its standard error and the mean reward, in percent."""
+    return {"preset": preset, "agents": agents, "targets": targets}
+
+
+@verb("navigation")
+def navigation(
+    agents: Annotated[int, typer.Option(help="Agents, and as many landmarks.")] = 3,
+    reward: Annotated[str, typer.Option(help="paper, mpe2 or mpe1.")] = "paper",
+    order: Annotated[str, typer.Option(help="Order of integration: mpe2 or mpe1.")] = "mpe2",
+) -> Fields:
+    """Navigation: the return and its standard error, landmarks covered at the end, collisions."""
+    return {"agents": agents, "reward": reward, "order": order}

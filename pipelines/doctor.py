@@ -1,0 +1,160 @@
+"""What may be wrong with an installation and its work folder: each check gives one line, with what to do."""
+
+import os
+import re
+import shutil
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from importlib.metadata import PackageNotFoundError, requires, version
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+from pipelines.store import Home, StoreError, one_line
+
+PYTHON = (3, 11)
+NEEDED = 2 * 2**30  # bytes free: a study of many runs with their checkpoints
+LOCK = Path(__file__).parents[1] / "requirements.lock"
+SHOWN = 4  # libraries that a line names
+
+Level = Literal["ok", "note", "fault"]
+
+
+class Finding(NamedTuple):
+    """What a check found; a `note` is worth knowing and nothing is wrong."""
+
+    level: Level
+    what: str
+    text: str
+
+
+def examine(home: Path, *, ray: bool = True) -> Iterator[Finding]:
+    """Every check in turn, the quick ones first.
+
+    Args:
+        home: the work folder; it need not be there.
+        ray: also start Ray, which takes seconds.
+    """
+    checks: list[Callable[[], Iterable[Finding]]] = [python, libraries, torch_build]
+    checks += [lambda: disk(home), lambda: store(Home(home)), *([starts_ray] if ray else [])]
+    for check in checks:
+        yield from check()
+
+
+def python(found: tuple[int, int] = (sys.version_info[0], sys.version_info[1])) -> list[Finding]:
+    """The interpreter's version."""
+    name = ".".join(map(str, found))
+    if found == PYTHON:
+        return [Finding("ok", "python", f"{name} ({sys.executable})")]
+    return [Finding("fault", "python", f"{name}, and 3.11 is needed: make setup PYTHON=/path/to/python3.11")]
+
+
+def libraries(pins: Mapping[str, str] | None = None) -> list[Finding]:
+    """Installed versions against the pins."""
+    wanted = locked() if pins is None else pins
+    other = []
+    for name, pinned in wanted.items():
+        try:
+            found = version(name).partition("+")[0]
+        except PackageNotFoundError:
+            found = "missing"
+        if found != pinned:
+            other.append(f"{name} {found} instead of {pinned}")
+    if not other:
+        return [Finding("ok", "libraries", f"all {len(wanted)} as pinned")]
+    more = f" and {len(other) - SHOWN} more" if len(other) > SHOWN else ""
+    return [Finding("fault", "libraries", f"{', '.join(other[:SHOWN])}{more}: make setup")]
+
+
+def locked() -> dict[str, str]:
+    """The pins by name: of the lock in a checkout, else those that the installed package asks for."""
+    lines = LOCK.read_text(encoding="utf-8").splitlines() if LOCK.exists() else requires("rhmc") or []
+    found = (re.match(r"([\w.-]+)(?:\[\w+\])?==([\w.]+)\s*$", line) for line in lines)
+    return {match[1]: match[2] for match in found if match}
+
+
+def torch_build() -> list[Finding]:
+    """Whether torch can compute here, and on what."""
+    try:
+        import torch
+
+        works = float(torch.ones(2) @ torch.ones(2)) == 2.0
+    except (ImportError, OSError, RuntimeError) as error:
+        return [Finding("fault", "torch", f"cannot be used ({one_line(error)}): make setup")]
+    if not works:
+        return [Finding("fault", "torch", "computes wrongly: make setup")]
+    cuda = torch.version.cuda
+    if cuda and not torch.cuda.is_available():
+        text = f"{torch.__version__}, built for CUDA {cuda}, and no device is here; the CPU build gives pinned results"
+        return [Finding("note", "torch", text)]
+    return [Finding("ok", "torch", f"{torch.__version__}, {f'CUDA {cuda}' if cuda else 'CPU build'}")]
+
+
+def disk(home: Path, needed: int = NEEDED) -> list[Finding]:
+    """Room for runs, and the right to write."""
+    there = next(folder for folder in (home, *home.parents) if folder.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK):
+        text = f"{there} cannot be written to: change its rights, or name another folder in RHMC_HOME"
+        return [Finding("fault", "work folder", text)]
+    free = shutil.disk_usage(there).free
+    text = f"{home}, {free / 2**30:.1f} GiB free"
+    if free < needed:
+        return [Finding("fault", "work folder", f"{text}, less than {needed / 2**30:.0f}: make room, or set RHMC_HOME")]
+    return [Finding("ok", "work folder", text)]
+
+
+def store(home: Home) -> Iterator[Finding]:
+    """Whether the log can be read, and what in it waits or is of other code."""
+    from pipelines.mlflow_tracker import census, tracking_uri
+
+    uri = tracking_uri(home)
+    try:
+        runs = census(home)
+    except StoreError as error:
+        yield Finding("fault", "store", str(error))
+        return
+    if runs is None:
+        yield Finding("ok", "store", f"{uri}: nothing logged yet")
+        return
+    from pipelines.fingerprint import fingerprint
+
+    here = fingerprint()
+    yield Finding("ok", "store", f"{uri}: {len(runs)} runs")
+    for status in ("running", "interrupted", "failed"):
+        where = Counter(run.experiment for run in runs if run.status == status and run.fingerprint == here)
+        if where:
+            yield Finding("note", "runs", f"{sum(where.values())} {status}: {_places(where)}: {ADVICE[status]}")
+    stale = Counter(run.experiment for run in runs if run.fingerprint != here)
+    if stale:
+        text = f"{sum(stale.values())} made by other code: {_places(stale)}: `rhmc study run` would train them again"
+        yield Finding("note", "stale", text)
+
+
+ADVICE = {
+    "running": "`rhmc study run` says whether another process drives them, else continues them",
+    "interrupted": "`rhmc study run` continues them",
+    "failed": "their tag `error` says why (`rhmc ui`); `rhmc study run` tries again",
+}
+
+
+def _places(count: Mapping[str, int]) -> str:
+    names = sorted(count)
+    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    return ", ".join(names[:SHOWN]) + more
+
+
+def starts_ray() -> list[Finding]:
+    """Whether Ray starts here, or its cluster answers."""
+    from pipelines.run import RAY_SETTINGS
+
+    os.environ.update({name: os.environ.get(name, value) for name, value in RAY_SETTINGS.items()})
+    from pipelines.ray_driver import ray_session
+
+    address = os.environ.get("RAY_ADDRESS")
+    try:
+        with ray_session(1):
+            pass
+    except StoreError as error:
+        advice = "start that cluster, or unset RAY_ADDRESS" if address else "free memory and /tmp, then try again"
+        return [Finding("fault", "ray", f"{error}: {advice}")]
+    return [Finding("ok", "ray", f"the cluster at {address} answers" if address else "starts")]

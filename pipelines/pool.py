@@ -1,0 +1,120 @@
+"""Workers for the trials of a search, as Ray actors.
+
+Not as trials of Ray Tune, which trains the runs of a study. A search decides anew after every point which trial goes on
+and what is tried next, and the decision has to be the same after an interruption. Tune asks its search algorithm ahead
+of time, keeps its own copy of the search's state, and runs callbacks, schedulers and stoppers in an order of its own.
+Asking and telling in plain sight needs none of that: a worker trains to the next point, the driver decides. The
+training itself, its checkpoints and the way it is stopped are those of the studies (`RunTrainable`).
+"""
+
+from contextlib import suppress
+from typing import Any, NamedTuple
+
+import ray
+from ray.exceptions import RayActorError, RayError
+
+from pipelines.ray_driver import cause_of
+from pipelines.seeds import Seeds
+from pipelines.store import StoreError
+from pipelines.study import Setting
+from pipelines.trainable import Job, RunTrainable
+
+
+class TrialJob(Job):
+    """What a worker gets. `spec` is the setting alone."""
+
+    seeds: list[int]
+
+
+class Failed(NamedTuple):
+    """A trial that raised, or whose worker died."""
+
+    error: str  # one line
+    trace: str
+
+
+class TrialTraining(RunTrainable):
+    """A trial trained point by point; made by hand, without Tune and the folder that it keeps in the home directory."""
+
+    def __init__(self, job: TrialJob) -> None:
+        self.seeds = job["seeds"]
+        self.setup({"job": job})
+
+    def make_trainer(self) -> Seeds:
+        """All seeds of the trial."""
+        return Seeds(Setting.model_validate_json(self.job["spec"]), self.seeds)
+
+
+class Worker:
+    """The process of a worker: one trial at a time."""
+
+    def __init__(self) -> None:
+        self.training: TrialTraining | None = None
+
+    def begin(self, job: TrialJob) -> dict[str, Any]:
+        """Take a trial, continue it where it was left, and train to the next point."""
+        self.end()
+        self.training = TrialTraining(job)
+        return self.step()
+
+    def step(self) -> dict[str, Any]:
+        """Train to the next point. See `RunTrainable` for the result."""
+        assert self.training is not None
+        return self.training.step()
+
+    def end(self) -> None:
+        """Let go of the trial."""
+        if self.training is not None:
+            self.training.cleanup()
+            self.training = None
+
+
+class Pool:
+    """`size` workers with `cpus` processors each; a worker is made when it is first needed."""
+
+    def __init__(self, size: int, cpus: int) -> None:
+        self.size, self.cpus = size, cpus
+        self.idle: list[Any] = []
+        self.busy: dict[str, Any] = {}  # by key of the trial
+        self.waiting: dict[Any, str] = {}  # a call that is under way -> key
+
+    @property
+    def free(self) -> int:
+        """Trials that could begin now."""
+        return self.size - len(self.busy)
+
+    def begin(self, job: TrialJob) -> None:
+        """Hand a trial to a worker."""
+        actor = self.idle.pop() if self.idle else self._worker()
+        self.busy[job["key"]] = actor
+        self.waiting[actor.begin.remote(job)] = job["key"]
+
+    def _worker(self) -> Any:
+        return ray.remote(Worker).options(num_cpus=self.cpus).remote()
+
+    def next(self, timeout: float) -> dict[str, dict[str, Any] | Failed]:
+        """Results that have come, by key; empty if none comes in `timeout` seconds. Call `go_on` or `end` for each."""
+        ready, _ = ray.wait(list(self.waiting), num_returns=1, timeout=timeout)
+        return {self.waiting[call]: self._result(self.waiting.pop(call), call) for call in ready}
+
+    def _result(self, key: str, call: Any) -> dict[str, Any] | Failed:
+        try:
+            result: dict[str, Any] = ray.get(call)
+            return result
+        except RayActorError as error:
+            del self.busy[key]
+            return Failed("the worker died", str(error))
+        except (RayError, StoreError) as error:
+            return Failed(cause_of(error), str(error))
+
+    def go_on(self, key: str) -> None:
+        """Let a trial train to the next point."""
+        self.waiting[self.busy[key].step.remote()] = key
+
+    def end(self, key: str) -> None:
+        """Let go of a trial; its worker is free."""
+        actor = self.busy.pop(key, None)
+        if actor is not None:
+            with suppress(RayError):
+                ray.get(actor.end.remote())
+                self.idle.append(actor)

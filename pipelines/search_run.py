@@ -1,0 +1,424 @@
+"""Launch a search: ask for trials, train them to the next point, decide, record. What is finished stays finished.
+
+The order of writing makes a kill at any moment harmless: a trial's result goes to the log first, then to Optuna, then
+its checkpoints are dropped. Whatever the kill left open is taken up by the next launch from its checkpoint.
+"""
+
+import hashlib
+import math
+import shlex
+import shutil
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from io import StringIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+from rich.console import Console
+from ruamel.yaml import YAML
+
+from pipelines.fingerprint import fingerprint
+from pipelines.found import file_name, slug, winner_yaml, write_text
+from pipelines.plan import commit
+from pipelines.progress import Board, board, print_table
+from pipelines.run import BAD, DONE, FAILED, INTERRUPTED, interrupt_to, set_up_ray
+from pipelines.search import Search
+from pipelines.store import Checkpoints, Home, StoreError
+from pipelines.tracker import Card, RunLog, Status, StudyCard, Tracker
+from pipelines.trials import OBJECTIVE, Asked, Ledger, explained, look, open_storage, storage_url
+from rhmc.types import Metrics
+
+if TYPE_CHECKING:
+    from pipelines.mlflow_tracker import MlflowTracker
+    from pipelines.pool import Failed, TrialJob
+
+PATIENCE = 1.0  # seconds between two looks at whether Ctrl-C was pressed
+
+
+class Workers(Protocol):
+    """Who trains. See `pool.Pool`."""
+
+    @property
+    def free(self) -> int: ...
+
+    def begin(self, job: "TrialJob") -> None: ...
+
+    def next(self, timeout: float) -> "dict[str, dict[str, Any] | Failed]": ...
+
+    def go_on(self, key: str) -> None: ...
+
+    def end(self, key: str) -> None: ...
+
+
+def run_search(search: Search, home: Path, out: Path | None = None) -> int:
+    """Bring a search to its end: keep what is finished, take up what was interrupted, try the rest.
+
+    Args:
+        search: the plan.
+        home: the work folder.
+        out: where the winners go; `found` beside the search's file if None, and the work folder where the search was
+            changed by overrides: a trial of the tool does not replace what was found in earnest.
+
+    Returns:
+        0 every trial is finished or pruned, 1 some failed, 2 something is in the way, 130 interrupted.
+    """
+    place = Home(home)
+    try:
+        place.prepare()
+        with place.lock(search.name, search.profile):
+            return _launch(search, place, out or found_folder(search, place))
+    except StoreError as error:
+        print(f"rhmc: {error}", file=sys.stderr)
+        return BAD
+    except KeyboardInterrupt:
+        print("rhmc: interrupted; the same command continues", file=sys.stderr)
+        return INTERRUPTED
+
+
+def found_folder(search: Search, home: Home) -> Path:
+    """Where the winners go."""
+    return plots_folder(search, home) / "found" if search.overrides else Path(search.file).parent / "found"
+
+
+def plots_folder(search: Search, home: Home) -> Path:
+    """Where the plots go."""
+    return home.root / "searches" / f"{search.name}-{search.profile}"
+
+
+def _launch(search: Search, home: Home, out: Path) -> int:
+    from pipelines.mlflow_tracker import MlflowTracker  # 3 s: only when something is launched
+
+    code, url = fingerprint(), storage_url(home)
+    storage = open_storage(home)
+    assert storage is not None
+    tracker = MlflowTracker(search_card(search), home)
+    status: Status = "interrupted"
+    try:
+        with explained(url), board(Console()) as display:
+            ledgers = [Ledger(search, arm, code, storage) for arm in search.arms]
+            for ledger in ledgers:
+                again = ledger.take_up()
+                display.say(f"{ledger.arm}: {ledger.closed} of {search.trials} trials are done, {again} are taken up")
+            if any(ledger.left for ledger in ledgers):
+                _train(search, ledgers, tracker, home, display, code)
+            whole = not any(ledger.left or ledger.live for ledger in ledgers)
+            for ledger in ledgers if not whole else []:
+                ledger.take_up()
+            written = results(search, ledgers, code, tracker, home, out if whole else None)
+        failed = any(ledger.counts()["failed"] for ledger in ledgers)
+        status = "interrupted" if not whole else "failed" if failed else "finished"
+    finally:
+        tracker.close(status)
+    _summary(search, ledgers, tracker, written, whole)
+    return {"finished": DONE, "failed": FAILED}.get(status, INTERRUPTED)
+
+
+def _train(search: Search, ledgers: Sequence[Ledger], tracker: Tracker, home: Home, display: Board, code: str) -> None:
+    set_up_ray()
+    from pipelines.pool import Pool
+    from pipelines.ray_driver import ray_session  # 3 s
+
+    scratch = home.scratch(search.name, search.profile)
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir(parents=True)
+    stop, resources = scratch / "stop", search.resources
+    try:
+        with ray_session(resources.concurrent * resources.cpus), interrupt_to(stop, display):
+            pool = Pool(resources.concurrent, resources.cpus)
+            Drive(search, ledgers, pool, Book(search, code, tracker, display), home, stop).run()
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+@dataclass
+class Running:
+    """A trial that is being trained."""
+
+    ledger: Ledger
+    asked: Asked
+    folder: Path  # of its checkpoints
+    points: int = 0  # of its curve so far
+
+
+class Drive:
+    """Asks, trains and tells until the budget is spent or `stop` exists.
+
+    Args:
+        search: the plan.
+        ledgers: of every arm.
+        pool: who trains.
+        book: the log.
+        home: where checkpoints lie.
+        stop: a file: once it exists, nothing new begins, and each trial saves itself at its next point.
+    """
+
+    def __init__(
+        self, search: Search, ledgers: Sequence[Ledger], pool: Workers, book: "Book", home: Home, stop: Path
+    ) -> None:
+        self.search, self.ledgers, self.pool, self.book = search, ledgers, pool, book
+        self.home, self.stop = home, stop
+        self.running: dict[str, Running] = {}
+
+    def run(self) -> None:
+        """To the end of the budget, or to the last trial that saved itself."""
+        self._fill()
+        while self.running:
+            for key, result in self.pool.next(PATIENCE).items():
+                self._take(key, result)
+            self._fill()
+
+    def _fill(self) -> None:
+        """Keep every worker busy; the arm that has most left to try goes first, so that all advance together."""
+        while self.pool.free and not self.stop.exists():
+            ledger = max(self.ledgers, key=lambda one: one.left)
+            if not ledger.left:
+                return
+            asked = ledger.ask()
+            if asked is not None:
+                self._begin(ledger, asked)
+
+    def _begin(self, ledger: Ledger, asked: Asked) -> None:
+        key = self.book.start(asked)
+        folder = self.home.checkpoints(key)
+        self.running[key] = Running(ledger, asked, folder)
+        self.pool.begin(
+            {
+                "key": key,
+                "spec": asked.setting.canonical(),
+                "seeds": self.search.seed_list(),
+                "folder": str(folder),
+                "checkpoint_every": self.search.resources.checkpoint_every,
+                "stop": str(self.stop),
+            }
+        )
+
+    def _take(self, key: str, result: "dict[str, Any] | Failed") -> None:
+        """What a worker reports of a trial."""
+        one = self.running[key]
+        if not isinstance(result, dict):
+            self._end(key)
+            self.book.fail(key, one.asked, result.error, result.trace)
+            one.ledger.fail(one.asked, result.error)
+            return
+        why = self._points(key, one, result["points"])
+        if why:
+            self._end(key)
+            self.book.prune(key, one.asked, why)
+            one.ledger.prune(one.asked, why)
+            Checkpoints(one.folder).clear()
+        elif result["stopped"]:
+            self._end(key)
+            self.book.interrupt(key, one.asked)
+        elif result["done"]:
+            self._end(key)
+            self._complete(key, one, result["points"][-1])
+        else:
+            self.pool.go_on(key)
+
+    def _points(self, key: str, one: Running, points: Sequence[Metrics]) -> str:
+        """Take in points one by one, so that a trial that continues with many is given up where it would have been.
+
+        Returns:
+            Why the trial should be given up; nothing if it should not.
+        """
+        for point in points:
+            why = one.ledger.report(one.asked, point, one.points)
+            self.book.points(key, one.asked, [point])
+            one.points += 1
+            if why:
+                return why
+        return ""
+
+    def _complete(self, key: str, one: Running, last: Metrics) -> None:
+        returns = [last[f"seeds/{seed}"] for seed in self.search.seed_list()]
+        self.book.complete(key, one.asked, last["step"], math.fsum(returns) / len(returns))
+        one.ledger.complete(one.asked, returns)
+        Checkpoints(one.folder).clear()
+
+    def _end(self, key: str) -> None:
+        self.pool.end(key)
+        del self.running[key]
+
+
+# The log
+
+
+class Book:
+    """Keeps the log and the board in step with the trials: a run for each, its curve the mean over the seeds.
+
+    Args:
+        search: whose.
+        code: fingerprint.
+        tracker: the log.
+        display: the board.
+    """
+
+    def __init__(self, search: Search, code: str, tracker: Tracker, display: Board) -> None:
+        self.search, self.code, self.tracker, self.board = search, code, tracker, display
+        self.commit = commit()
+        self.logs: dict[str, RunLog] = {}
+
+    def start(self, asked: Asked) -> str:
+        """A trial begins or continues; returns its key, which names it in the log and in the checkpoints."""
+        card = trial_card(self.search, asked, self.code, self.commit)
+        log = self.logs[card.key] = self.tracker.start(card)
+        log.tag("trial", str(asked.place))
+        log.text("config.yaml", self._yaml(asked, card))
+        self.board.start(self._name(asked), self.search.steps)
+        return card.key
+
+    def _yaml(self, asked: Asked, card: Card) -> str:
+        head = {"search": self.search.name, "profile": self.search.profile, "arm": asked.arm, "trial": asked.place}
+        names = {"fingerprint": self.code, "commit": card.commit, "seeds": self.search.seed_list()}
+        out = StringIO()
+        YAML().dump(head | names | asked.setting.model_dump(mode="json"), out)
+        return out.getvalue()
+
+    def points(self, key: str, asked: Asked, points: list[Metrics]) -> None:
+        """New points of a trial's curve."""
+        self.logs[key].log(points)
+        self.board.points(self._name(asked), points)
+
+    def complete(self, key: str, asked: Asked, step: float, value: float) -> None:
+        """A trial ended: its value is the metric `objective`, which a pruned one has not."""
+        self.logs[key].log([{"step": step, "objective": value}])
+        self._end(key, asked, "complete", "finished", f"objective {value:.2f}")
+
+    def prune(self, key: str, asked: Asked, why: str) -> None:
+        """A trial is given up."""
+        self._end(key, asked, "pruned", "finished", f"pruned, {why}")
+
+    def interrupt(self, key: str, asked: Asked) -> None:
+        """A trial saved itself for the next launch."""
+        self._end(key, asked, "interrupted", "interrupted", "stopped; the next launch continues it")
+
+    def fail(self, key: str, asked: Asked, error: str, trace: str) -> None:
+        """A trial raised: keep why, go on with the others."""
+        self.logs[key].tag("error", error)
+        self.logs[key].text("error.txt", trace)
+        self._end(key, asked, "failed", "failed", f"failed: {error}")
+
+    def _end(self, key: str, asked: Asked, state: str, status: Status, text: str) -> None:
+        log = self.logs.pop(key)
+        log.tag("state", state)
+        log.finish(status)
+        self.board.end(self._name(asked), text)
+
+    def _name(self, asked: Asked) -> str:
+        return f"{self.search.name} / {asked.name}"
+
+
+def trial_card(search: Search, asked: Asked, code: str, commit: str) -> Card:
+    """A trial as its log shows it. Two trials with the same values are two runs."""
+    parts = (asked.setting.canonical(), str(search.seed_list()), str(asked.place), search.identity(asked.arm, code))
+    spec_id = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:12]
+    kinds = asked.setting.algo.kind, asked.setting.env.kind
+    params = {f"algo.{name}": str(value) for name, value in asked.params.items()}
+    return Card(asked.arm, search.seed_list()[0], spec_id, code, *kinds, commit, params, asked.place)
+
+
+def search_card(search: Search) -> StudyCard:
+    """The search as its experiment shows it."""
+    seeds = search.seed_list()
+    spaces = [
+        f"- {name}: " + ", ".join(f"`{key}` {one}" for key, one in arm.space.items())
+        for name, arm in search.arms.items()
+    ]
+    note = (
+        f"{search.question}\n\n"
+        f"Search, profile `{search.profile}`: every arm has {search.trials} trials of {len(seeds)} seeds "
+        f"({seeds[0]} to {seeds[-1]}) and {search.steps:,} environment steps each. Sampler {search.sampler.kind}, "
+        f"pruner {search.pruner.kind}.\n\n" + "\n".join(spaces) + "\n\nA run is a trial: its curve is the mean over "
+        "its seeds, `objective` the mean of their final returns. Pruned trials have no `objective`."
+    )
+    return StudyCard(search.name, search.profile, note)
+
+
+# Results
+
+
+class Written(NamedTuple):
+    """Files that a launch left."""
+
+    winners: list[Path]
+    plots: list[Path]
+
+
+def results(
+    search: Search, ledgers: Sequence[Ledger], code: str, tracker: Tracker, home: Home, out: Path | None
+) -> Written:
+    """Write the plots, and the winners once the budget is spent (`out` is given); keep all of them with the log."""
+    from pipelines.search_plots import plots
+
+    written = Written([], [])
+    for ledger in ledgers:
+        title = f"{search.name} ({search.profile}): {ledger.arm}"
+        written.plots.extend(plots(ledger.study, title, plots_folder(search, home) / slug(ledger.arm)))
+        best = ledger.best()
+        if out is not None and best is not None:
+            file = out / file_name(search, ledger.arm)
+            write_text(file, winner_yaml(search, ledger.arm, best, ledger.counts(), code))
+            written.winners.append(file)
+    for file in (*written.plots, *written.winners):
+        tracker.keep(file)
+    return written
+
+
+def _summary(
+    search: Search, ledgers: Sequence[Ledger], tracker: "MlflowTracker", written: Written, whole: bool
+) -> None:
+    console = Console()
+    console.print()
+    print_table(console, HEADER, [_row(ledger) for ledger in ledgers])
+    lines = [_best_line(ledger) for ledger in ledgers]
+    lines += [f"winner: {file}" for file in written.winners]
+    lines += [f"plot:   {file}" for file in written.plots]
+    lines += [f"look:   {tracker.where()}", f"        experiment {tracker.name!r} in {tracker.uri}"]
+    changes = [word for text in search.overrides for word in ("--set", text)]
+    again = shlex.join([search.file, "--profile", search.profile, *changes])
+    lines += [] if whole else [f"next:   rhmc search run {again}   (continues)"]
+    console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+
+
+HEADER = ["arm", "trials", "complete", "pruned", "running", "waiting", "failed", "missing", "best"]
+
+
+def _row(ledger: Ledger) -> list[str]:
+    counts, best = ledger.counts(), ledger.best()
+    numbers = [str(counts[name]) for name in HEADER[2:-1]]
+    return [ledger.arm, str(ledger.search.trials), *numbers, f"{best.value:.2f}" if best else "-"]
+
+
+def _best_line(ledger: Ledger) -> str:
+    best = ledger.best()
+    if best is None:
+        return f"{ledger.arm}: no trial is finished"
+    values = ", ".join(f"{name}={_short(value)}" for name, value in best.params.items())
+    return f"{ledger.arm}: {OBJECTIVE} {best.value:.2f} over {len(best.returns)} seeds in trial {best.place}: {values}"
+
+
+def _short(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def show_search(search: Search, home: Path) -> int:
+    """Print how far a search is: trials by state, the best so far, and those of other settings or code (stale).
+
+    Returns:
+        0 every trial is closed, 1 not, 2 something is in the way.
+    """
+    place, code = Home(home), fingerprint()
+    try:
+        storage = open_storage(place, write=False)
+        with explained(storage_url(place)):
+            if storage is None:
+                print(f"{search.name} ({search.profile}): nothing has been tried yet")
+                return FAILED
+            found = [look(search, arm, code, storage) for arm in search.arms]
+            print_table(Console(), [*HEADER, "stale"], [[*_row(ledger), str(stale)] for ledger, stale in found])
+            print("\n".join(_best_line(ledger) for ledger, _ in found))
+            return DONE if all(ledger.closed >= search.trials for ledger, _ in found) else FAILED
+    except StoreError as error:
+        print(f"rhmc: {error}", file=sys.stderr)
+        return BAD

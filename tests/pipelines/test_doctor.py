@@ -1,0 +1,91 @@
+"""What the doctor says of installations that are well and of those that are not."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from pipelines import doctor
+from pipelines.doctor import Finding, disk, examine, libraries, locked, python, starts_ray, store, torch_build
+from pipelines.mlflow_tracker import MlflowTracker
+from pipelines.plan import study_card
+from pipelines.store import Home
+from tests.pipelines.support import CODE, plan, tiny
+
+
+def test_another_python_is_a_fault() -> None:
+    assert python((3, 11))[0].level == "ok"
+    assert python((3, 12)) == [
+        Finding("fault", "python", "3.12, and 3.11 is needed: make setup PYTHON=/path/to/python3.11")
+    ]
+
+
+def test_libraries_against_the_lock() -> None:
+    assert {"torch", "ray", "mlflow", "pydantic"} <= locked().keys()
+    assert libraries({"filelock": "0"})[0].level == "fault"
+    (found,) = libraries({"no-such-library": "1.0"} | dict.fromkeys(("torch", "numpy", "rich", "typer"), "0.1"))
+    assert found.text.startswith("no-such-library missing instead of 1.0, torch 2")
+    assert found.text.endswith(" and 1 more: make setup")
+    assert libraries({})[0] == Finding("ok", "libraries", "all 0 as pinned")
+
+
+def test_torch_computes_here() -> None:
+    assert [(one.level, one.what) for one in torch_build()] == [("ok", "torch")]
+
+
+def test_room_and_rights(tmp_path: Path) -> None:
+    assert disk(tmp_path / "work", needed=1)[0].level == "ok"
+    (full,) = disk(tmp_path, needed=2**70)
+    assert full.level == "fault"
+    assert "make room, or set RHMC_HOME" in full.text
+    (tmp_path / "file").touch()
+    (closed,) = disk(tmp_path / "file" / "work", needed=1)
+    assert (closed.level, closed.text.split()[0]) == ("fault", str(tmp_path / "file"))
+
+
+def test_a_store_that_is_none_or_not_there(tmp_path: Path) -> None:
+    assert [one.level for one in store(Home(tmp_path))] == ["ok"]
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "mlflow.db").write_text("something else" * 100)
+    (found,) = store(Home(tmp_path))
+    assert found.level == "fault"
+    assert f"{tmp_path}/mlflow.db: not an MLflow database" in found.text
+
+
+def test_what_waits_and_what_is_of_other_code(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipelines.fingerprint.fingerprint", lambda: CODE)
+    tracker = MlflowTracker(study_card(tiny()), Home(home))
+    slow, fast = plan()
+    tracker.start(slow.card).finish("interrupted")
+    tracker.start(fast.card).finish("failed")
+    tracker.start(slow.card._replace(fingerprint="0ther")).finish("finished")
+    found = [(one.level, one.what, one.text.split(":")[0]) for one in store(Home(home))]
+    assert found[0][:2] == ("ok", "store")
+    assert found[1:] == [
+        ("note", "runs", "1 interrupted"),
+        ("note", "runs", "1 failed"),
+        ("note", "stale", "1 made by other code"),
+    ]
+
+
+def test_a_cluster_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ray.is_initialized", lambda: False)
+    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
+    (found,) = starts_ray()
+    assert found.level == "fault"
+    assert found.text.endswith("start that cluster, or unset RAY_ADDRESS")
+
+
+@pytest.mark.ray
+def test_ray_starts(cluster: None) -> None:
+    assert starts_ray() == [Finding("ok", "ray", "starts")]
+
+
+def test_an_examination_goes_on_after_a_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "NEEDED", 2**70)
+    monkeypatch.setattr(doctor, "LOCK", tmp_path / "none")
+    monkeypatch.setattr(doctor, "requires", lambda name: ["torch==0.1", 'x==1; extra == "test"'])
+    found = list(examine(tmp_path, ray=False))
+    assert [one.what for one in found] == ["python", "libraries", "torch", "work folder", "store"]
+    assert found[1].level == "fault"
+    assert str(sys.executable) in found[0].text
