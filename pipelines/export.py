@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 
 from pipelines.fingerprint import fingerprint
 from pipelines.plan import Item, items, study_card
-from pipelines.store import Home, StoreError, work_folder
+from pipelines.store import Home, StoreError, replace_durably, work_folder
 from pipelines.study import Study
 from pipelines.tracker import Recorded, Row, Tracker
 
@@ -114,7 +114,7 @@ def write_parquet(path: Path, schema: pa.Schema, rows: list[tuple[object, ...]])
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         pq.write_table(table, part, compression="zstd", version="2.6", row_group_size=2**20)
-        part.replace(path)
+        replace_durably(part, path)
     except OSError as error:
         with suppress(OSError):
             part.unlink(missing_ok=True)
