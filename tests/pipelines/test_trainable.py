@@ -148,8 +148,9 @@ def test_a_failure_is_a_result(start: Start, tmp_path: Path, monkeypatch: pytest
         raise StoreError("x.pt: cannot be written: No space left on device")
 
     run = start()
-    monkeypatch.setattr(Checkpoints, "save", full)
-    result = run.step()
+    with monkeypatch.context() as patch:
+        patch.setattr(Checkpoints, "save", full)
+        result = run.step()
     assert (result["done"], result["error"]) == (True, "x.pt: cannot be written: No space left on device")
     assert "Traceback" in result["trace"]
     (tmp_path / "b").mkdir()
