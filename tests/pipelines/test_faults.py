@@ -137,6 +137,7 @@ def test_two_studies_at_once_and_a_reader(tmp_path: Path, template: Path, whole:
         for run in client.search_runs(places, order_by=["metrics.`eval/return` DESC"]):
             client.get_metric_history(run.info.run_id, "eval/return")
         reads += 1
+        time.sleep(0.02)
     said = (home / "driver.log").read_text()
     assert [driver.exitcode for driver in drivers] == [0, 0], said
     assert "locked" not in said
