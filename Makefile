@@ -3,6 +3,7 @@
 #   PYTHON=...           the Python 3.11 to use, where `python3.11` is not on the path
 #   PIP_TORCH_ARGS=...   options for the installation of torch alone, such as the index that has its CPU build
 #   JOBS=2               tests at once
+#   KILLS=60 SEED=0      of `make soak`
 
 SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
@@ -11,6 +12,8 @@ SHELL := bash
 
 PIP_TORCH_ARGS ?=
 JOBS ?= 2
+KILLS ?= 60
+SEED ?= 0
 PROFILE := $(shell sed -n 's/^profile: *//p' params.yaml)
 IS_311 := -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))'
 PYTHON ?= $(shell for p in python3.11 python3; do $$p $(IS_311) 2>/dev/null && echo $$p && break; done)
@@ -23,7 +26,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_NO_INPUT := 1
 unexport PYTHONPATH
 
-.PHONY: help setup repro test check bench report ui lock clean
+.PHONY: help setup repro test check bench soak report ui lock clean
 
 help: ## What there is to make
 	@grep -hE '^[a-z]+:.*## ' Makefile | sed -E 's/^([a-z]+):[^#]*## /  make \1\t/' | expand -t 14
@@ -47,6 +50,9 @@ check: $(READY) ## Lint and types only
 bench: $(READY) ## Speed of the environments and of training, as Markdown tables
 	@python benchmarks/env_speed.py
 	@python benchmarks/train_speed.py
+
+soak: $(READY) ## Kill drivers, workers and servers of studies again and again; prints what was lost (nothing)
+	@python -m tests.pipelines.soak --kills $(KILLS) --seed $(SEED)
 
 report: $(READY) ## The report again, from the exported runs
 	@rhmc report --profile $(PROFILE)

@@ -1,6 +1,8 @@
 """The command `rhmc`. The verbs are in `pipelines.commands`, a module for each noun.
 
 Everything heavy is imported by the verb that needs it, so that help answers at once.
+
+Exit codes: 0 done, 1 some run failed, 2 bad input (nothing was started), 130 interrupted, 143 terminated.
 """
 
 import os

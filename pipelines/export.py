@@ -108,5 +108,5 @@ def write_parquet(path: Path, schema: pa.Schema, rows: list[tuple[object, ...]])
     """
     columns = list(zip(*rows, strict=True)) or [()] * len(schema)
     table = pa.table([pa.array(column, field.type) for column, field in zip(columns, schema, strict=True)], schema)
-    with whole(path) as part:
+    with whole(path, durable=True) as part:
         pq.write_table(table, part, compression="zstd", version="2.6", row_group_size=2**20)

@@ -8,6 +8,7 @@ import os
 import sqlite3
 import time
 import urllib.error
+import urllib.parse
 import urllib.request
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -17,13 +18,13 @@ from typing import Any, NamedTuple
 
 from filelock import FileLock
 
-from pipelines.store import Home, StoreError, one_line
+from pipelines.store import Home, StoreError, one_line, replace_durably, sync
 from pipelines.tracker import Card, Recorded, Row, Status, StudyCard, unseen
 from rhmc.types import Metrics
 
 os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
-os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "3")
 os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
+os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "4")  # 28 s: a server that was killed is back by then
 
 from mlflow import MlflowClient
 from mlflow.entities import Metric, Param, Run, RunTag, ViewType
@@ -39,6 +40,7 @@ STATUS: dict[Status, str] = {
 FROM_MLFLOW: dict[str, Status] = {theirs: ours for ours, theirs in STATUS.items()}
 BATCH = 1000  # values that one request may carry
 PARENT = "study"  # tag `role` of the parent run; its runs have `run`
+PATIENCE = 20.0  # seconds that a reader waits for a writer of SQLite, as MLflow's own do
 
 
 def tracking_uri(home: Home) -> str:
@@ -81,22 +83,49 @@ class MlflowTracker:
         name = experiment_name(self.study)
         found = self.client.get_experiment_by_name(name)
         if found is None and write:
-            local = self.uri.startswith("sqlite:")
-            return self.client.create_experiment(name, home.artifacts.as_uri() if local else None)
+            return self._create_experiment(name, home.artifacts.as_uri() if self.uri.startswith("sqlite:") else None)
         if found is not None and found.lifecycle_stage != "active":
             if not write:
                 return None
             self.client.restore_experiment(found.experiment_id)
         return found.experiment_id if found else None
 
+    def _create_experiment(self, name: str, artifacts: str | None) -> str:
+        try:
+            return self.client.create_experiment(name, artifacts)
+        except MlflowException:
+            found = self.client.get_experiment_by_name(name)  # made just now: the answer was lost and asked for again
+            if found is None:
+                raise
+            return found.experiment_id
+
     def _parent(self) -> str:
-        runs = self._search("tags.role = 'study'")
-        ref = runs[0].info.run_id if runs else self._create(self.study.study, {"role": PARENT}).info.run_id
+        ref = self._only("tags.role = 'study'", self.study.study, {"role": PARENT}).info.run_id
         assert self.experiment is not None
         self.client.set_experiment_tag(self.experiment, "mlflow.note.content", self.study.note)
         self.client.set_tag(ref, "mlflow.note.content", self.study.note)
         self.client.update_run(ref, "RUNNING")
         return ref
+
+    def _only(self, query: str, name: str, tags: dict[str, str], variant: str | None = None) -> Run:
+        """The one run that matches, made if there is none.
+
+        A request whose answer is lost is sent again, and then a server that was killed may have made the run twice.
+        Both are empty: whatever was logged afterwards went to a run that this function chose, the oldest.
+        """
+
+        def there() -> list[Run]:
+            found = self._search(query)
+            return found if variant is None else [run for run in found if run.data.tags["variant"] == variant]
+
+        runs = there()
+        if not runs:
+            self._create(name, tags)
+            runs = there()
+        run, *doubles = runs
+        for double in doubles:
+            self.client.delete_run(double.info.run_id)
+        return run
 
     def _create(self, name: str, tags: dict[str, str]) -> Run:
         tags = tags | {"study": self.study.study, "profile": self.study.profile}
@@ -137,19 +166,17 @@ class MlflowTracker:
         """See `Tracker`."""
         query = f"tags.role = 'run' and tags.spec = '{card.spec_id}' and tags.fingerprint = '{card.fingerprint}'"
         with explained(self.uri):
-            for run in self._search(query):
-                if run.data.tags["variant"] == card.arm:
-                    self._reopen(run)
-                    seen = {(row.metric, row.step) for row in self.rows([run.info.run_id])}
-                    return MlflowRun(self.client, self.uri, run.info.run_id, seen)
-            run = self._create(card.name, self._tags(card))
-            self.client.log_batch(run.info.run_id, params=[Param(k, v) for k, v in card.params.items()])
-        return MlflowRun(self.client, self.uri, run.info.run_id, set())
-
-    def _reopen(self, run: Run) -> None:
-        self.client.update_run(run.info.run_id, "RUNNING")
-        if "error" in run.data.tags:
-            self.client.delete_tag(run.info.run_id, "error")
+            run = self._only(query, card.name, self._tags(card), card.arm)
+            ref = run.info.run_id
+            if run.info.status != STATUS["running"]:
+                self.client.update_run(ref, STATUS["running"])
+            if "error" in run.data.tags:
+                self.client.delete_tag(ref, "error")
+            new = [Param(name, value) for name, value in card.params.items() if name not in run.data.params]
+            if new:  # a new run, or one whose driver was killed between making it and this
+                self.client.log_batch(ref, params=new)
+            seen = {(row.metric, row.step) for row in self.rows([ref])} if run.data.metrics else set()
+        return MlflowRun(self.client, self.uri, ref, seen)
 
     def _tags(self, card: Card) -> dict[str, str]:
         return {
@@ -182,9 +209,9 @@ class MlflowTracker:
         """The client's answer, read from MLflow's table `metrics` at once."""
         first: dict[tuple[str, int, str], float] = {}
         query = "SELECT run_uuid, step, key, value, is_nan FROM metrics WHERE run_uuid = ? ORDER BY timestamp"
-        with closing(sqlite3.connect(f"file:{sqlite_file(self.uri)}?mode=rw", uri=True)) as database:
+        with closing(connect(sqlite_file(self.uri))) as database:
             for ref in refs:
-                for run, step, metric, value, is_nan in database.execute(query, (ref,)):
+                for run, step, metric, value, is_nan in database.execute(query, (ref,)).fetchall():  # let writers in
                     first.setdefault((run, step, metric), float("nan") if is_nan else value)
         return (Row(*place, value) for place, value in first.items())
 
@@ -250,7 +277,20 @@ class MlflowRun:
     def finish(self, status: Status) -> None:
         """See `RunLog`."""
         with explained(self.uri):
+            if status == "finished":
+                self._make_durable()
             self.client.set_terminated(self.ref, STATUS[status])
+
+    def _make_durable(self) -> None:
+        """Files before the word that they are there: a run that is finished is never looked at again.
+
+        Where a server keeps the files, that is its business.
+        """
+        address = urllib.parse.urlsplit(self.client.get_run(self.ref).info.artifact_uri)
+        folder = Path(urllib.request.url2pathname(address.path))
+        if address.scheme in ("", "file") and folder.is_dir():
+            for path in (*folder.rglob("*"), folder, *list(folder.parents)[:3]):
+                sync(path)
 
 
 def charts(uri: str, server: str) -> list[tuple[str, str]]:
@@ -311,9 +351,9 @@ def _recorded(run: Run) -> Recorded:
 
 
 def quieten() -> None:
-    """Keep MLflow and its migrations from talking."""
+    """Keep MLflow and its migrations from talking: what goes wrong, such as a full disk, they raise as well."""
     for name in ("mlflow", "alembic"):
-        logging.getLogger(name).setLevel(logging.ERROR)
+        logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
 def sqlite_file(uri: str) -> Path:
@@ -342,13 +382,17 @@ def _check_file(path: Path) -> None:
             return
         if not os.access(path, os.W_OK):
             raise StoreError(f"{path}: the MLflow database cannot be written to (read-only)")
-        # Not read-only: whoever was killed in the middle of a write left a journal, and SQLite now plays it back.
-        with closing(sqlite3.connect(f"file:{path}?mode=rw", uri=True)) as database:
+        with closing(connect(path)) as database:
             tables = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     except (sqlite3.Error, OSError) as error:
         raise StoreError(f"{path}: not an MLflow database ({error}); {advice}") from error
     if tables and not {"experiments", "runs", "metrics", "alembic_version"} <= tables:
         raise StoreError(f"{path}: a database, but not MLflow's; {advice}")
+
+
+def connect(path: Path) -> sqlite3.Connection:
+    """The database, to read beside whoever writes. Not read-only: a killed writer's journal has to be played back."""
+    return sqlite3.connect(f"file:{path}?mode=rw", PATIENCE, uri=True)
 
 
 def create_database(path: Path) -> None:
@@ -360,7 +404,7 @@ def create_database(path: Path) -> None:
         part.unlink(missing_ok=True)
         try:
             MlflowClient(f"sqlite:///{part}").search_experiments()
-            part.replace(path)
+            replace_durably(part, path)
         finally:
             part.unlink(missing_ok=True)
 

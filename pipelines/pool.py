@@ -13,11 +13,10 @@ from typing import Any, NamedTuple
 import ray
 from ray.exceptions import RayActorError, RayError
 
-from pipelines.ray_driver import cause_of
 from pipelines.seeds import Seeds
-from pipelines.store import StoreError
+from pipelines.store import one_line
 from pipelines.study import Setting
-from pipelines.trainable import Job, RunTrainable
+from pipelines.trainable import Job, RunTrainable, ending
 
 
 class TrialJob(Job):
@@ -53,9 +52,14 @@ class Worker:
 
     def begin(self, job: TrialJob) -> dict[str, Any]:
         """Take a trial, continue it where it was left, and train to the next point."""
-        self.end()
-        self.training = TrialTraining(job)
-        return self.step()
+        result: dict[str, Any] = {"busy": True}
+        for _ in range(2):  # the second time whoever had it, the worker of a killed driver, has let go
+            self.end()
+            self.training = TrialTraining(job)
+            result = self.step()
+            if not result.get("busy"):
+                return result
+        return ending(error=f"{job['folder']}: another process is training this trial", trace="")
 
     def step(self) -> dict[str, Any]:
         """Train to the next point. See `RunTrainable` for the result."""
@@ -100,12 +104,12 @@ class Pool:
     def _result(self, key: str, call: Any) -> dict[str, Any] | Failed:
         try:
             result: dict[str, Any] = ray.get(call)
-            return result
+            return Failed(result["error"], result["trace"]) if "error" in result else result
         except RayActorError as error:
             del self.busy[key]
             return Failed("the worker died", str(error))
-        except (RayError, StoreError) as error:
-            return Failed(cause_of(error), str(error))
+        except RayError as error:
+            return Failed(f"{type(error).__name__}: {one_line(error)}", str(error))
 
     def go_on(self, key: str) -> None:
         """Let a trial train to the next point."""

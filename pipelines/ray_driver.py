@@ -2,11 +2,11 @@
 
 import logging
 import os
-import pickle
+import shutil
 import socket
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from pipelines.store import StoreError, one_line
 from pipelines.trainable import RunTrainable
 
 KNOCK = 5.0  # seconds to wait for a cluster to answer
+DEATHS = 3  # workers that may die in a row on one run without getting it further
 
 
 def _knock(address: str | None) -> None:
@@ -33,8 +34,38 @@ def _knock(address: str | None) -> None:
 
 
 @contextmanager
-def ray_session(cpus: int) -> Iterator[None]:
+def sockets(name: str) -> Iterator[Path]:
+    """A folder for Ray's sockets, whose paths may hold 107 characters: it cannot lie in the work folder.
+
+    A killed driver leaves it behind, so it has the same name each time and is emptied first.
+
+    Args:
+        name: tells it from those of other drivers that may run now.
+
+    Raises:
+        StoreError: it cannot be made.
+    """
+    folder = Path(tempfile.gettempdir()) / f"ray-{name}"
+    shutil.rmtree(folder, ignore_errors=True)
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        if folder.stat().st_uid != os.getuid():
+            raise PermissionError(0, "belongs to another user")
+    except OSError as error:
+        raise StoreError(f"{folder}: Ray's folder cannot be made: {error.strerror}") from error
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def ray_session(cpus: int, name: str = "") -> Iterator[None]:
     """The cluster at `$RAY_ADDRESS`, or one on this machine for as long as it is needed.
+
+    Args:
+        cpus: of one on this machine.
+        name: see `sockets`; this process if empty.
 
     Raises:
         StoreError: the cluster cannot be reached, or none can be started.
@@ -45,8 +76,7 @@ def ray_session(cpus: int) -> Iterator[None]:
     address = os.environ.get("RAY_ADDRESS")
     _knock(address)
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.CRITICAL}
-    # The paths of Ray's sockets may hold 107 characters, so they cannot lie in the work folder.
-    with tempfile.TemporaryDirectory(prefix="ray", ignore_cleanup_errors=True) as sockets:
+    with sockets(name or str(os.getpid())) as folder:
         try:
             if address:
                 ray.init(address=address, **quiet)
@@ -57,7 +87,7 @@ def ray_session(cpus: int) -> Iterator[None]:
                     num_cpus=cpus,
                     include_dashboard=False,
                     object_store_memory=100 * 2**20,
-                    _temp_dir=sockets,
+                    _temp_dir=str(folder),
                     **quiet,
                 )
         except (ConnectionError, OSError, RuntimeError, ValueError) as error:
@@ -73,7 +103,7 @@ def fit(jobs: list[dict[str, Any]], recorder: Recorder, scratch: Path, concurren
     """Run the jobs, `concurrent` at a time with `cpus` each.
 
     Raises:
-        StoreError: what the recorder raised; the jobs are then stopped.
+        StoreError: what the recorder raised, the jobs are then stopped; or Ray itself broke down.
     """
     logging.getLogger("ray").setLevel(logging.CRITICAL)
     bridge = Bridge(recorder, stop)
@@ -87,12 +117,16 @@ def fit(jobs: list[dict[str, Any]], recorder: Recorder, scratch: Path, concurren
             verbose=0,
             callbacks=[bridge],
             stop=Halt(bridge),
-            failure_config=tune.FailureConfig(max_failures=0),
+            failure_config=tune.FailureConfig(max_failures=DEATHS - 1),
             # Left open, Tune would save every run once more at its end, also one that was stopped before it began.
             checkpoint_config=tune.CheckpointConfig(checkpoint_at_end=False),
         ),
     )
-    tuner.fit()
+    try:
+        tuner.fit()
+    except Exception as error:  # a full disk, a killed raylet: whatever it is, the next launch continues
+        if bridge.error is None:
+            raise StoreError(f"Ray cannot go on: {type(error).__name__}: {one_line(error)}") from error
     if bridge.error:
         raise bridge.error
 
@@ -104,6 +138,7 @@ class Bridge(tune.Callback):
         self.recorder, self.stop = recorder, stop
         self.error: StoreError | None = None
         self.live: set[str] = set()
+        self.furthest: dict[str, float] = {}  # key -> last step of its points; a continued run tells old ones again
 
     def __getstate__(self) -> dict[str, Any]:
         """Tune writes its callbacks to a file, from which nothing is ever restored here."""
@@ -120,17 +155,28 @@ class Bridge(tune.Callback):
     ) -> None:
         """Ray calls this after each step."""
         key = key_of(trial)
+        last = max((point["step"] for point in result["points"]), default=-1.0)
+        if last > self.furthest.get(key, -1.0):
+            self.furthest[key] = last
+            trial.max_failures = trial.num_failures + DEATHS - 1
         if result["done"]:
             self.live.discard(key)
         if key in self.recorder.logs:
             self._safely(self.recorder.result, key, result)
 
+    def on_trial_recover(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
+        """Ray calls this when a worker died and another one will take its trial."""
+        self.live.discard(key_of(trial))
+        self._safely(self.recorder.died, key_of(trial))
+
     def on_trial_error(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
-        """Ray calls this when a worker raised or died."""
+        """Ray calls this when a worker died and none will take its trial."""
         key = key_of(trial)
         self.live.discard(key)
+        trace = Path(trial.error_file).read_text() if trial.error_file else ""
+        last = next((line.strip() for line in reversed(trace.splitlines()) if line.strip()), "no reason given")
         if key in self.recorder.logs or not self.stop.exists():  # what had not begun when all was stopped just waits
-            self._safely(self.recorder.failed, key, *why(trial))
+            self._safely(self.recorder.failed, key, f"its worker died: {last[:300]}", trace)
 
     def _safely(self, call: Any, *args: Any) -> None:
         if self.error:
@@ -164,27 +210,3 @@ class Halt(tune.Stopper):
 def key_of(trial: Trial) -> str:
     """The key of the training that a trial runs."""
     return str(trial.config["job"]["key"])
-
-
-def why(trial: Trial) -> tuple[str, str]:
-    """(one line, full text) of a trial's error, from the files that Tune wrote before it told us."""
-    trace = Path(trial.error_file).read_text() if trial.error_file else ""
-    error: BaseException | None = None
-    if trial.pickled_error_file:
-        with suppress(Exception):  # what a library raised need not survive being pickled
-            error = pickle.loads(Path(trial.pickled_error_file).read_bytes())
-    if error is None:
-        lines = [line.strip() for line in trace.splitlines() if line.strip()]
-        return (lines[-1] if lines else "no reason given"), trace
-    return cause_of(error), trace
-
-
-def cause_of(error: BaseException) -> str:
-    """One line on what a worker raised, from what Ray made of it."""
-    cause = getattr(error, "cause", None) or error
-    if isinstance(cause, StoreError):
-        return str(cause)
-    lines = [line.strip() for line in str(cause).splitlines() if line.strip()]
-    if len(lines) > 1 and "creation task" in lines[0]:  # setup raised; the error ends Ray's traceback
-        return lines[-1].removeprefix("pipelines.store.StoreError: ")
-    return f"{type(cause).__name__}: {one_line(cause)}"

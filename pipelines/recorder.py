@@ -30,24 +30,42 @@ class Recorder:
         self.logs: dict[str, RunLog] = {}
         self.failures: dict[str, str] = {}  # name of the run -> one line
         self.waiting: dict[str, list[Item]] = defaultdict(list)
+        self.busy = False  # whether another process was training one of them
         done = finished(tracker.recorded())
         for item in plan:
             if (item.card.arm, item.key) not in done:
                 self.waiting[item.key].append(item)
         self.skipped = len(plan) - self.left
+        self._tidy()
+
+    def _tidy(self) -> None:
+        """Remove what a launch left that was killed between finishing a run and removing its checkpoints."""
+        for key in {item.key for item in self.plan} - self.waiting.keys():
+            Checkpoints(self.home.checkpoints(key)).clear_unused()
 
     @property
     def left(self) -> int:
         """Planned runs that are not finished."""
         return sum(len(items) for items in self.waiting.values())
 
-    def reuse(self) -> None:
-        """Copy what was finished already, for another arm or in another study, instead of training it again."""
+    def reuse(self) -> bool:
+        """Copy what was finished already, for another arm or in another study, instead of training it again.
+
+        Returns:
+            Whether anything is left to train.
+        """
         if not self.waiting:
-            return
+            return False
         there = self.tracker.finished_anywhere(self.plan[0].card.fingerprint)
         for key in [key for key in self.waiting if key in there]:
             self._copy(there[key], self.waiting.pop(key))
+            Checkpoints(self.home.checkpoints(key)).clear_unused()
+        return bool(self.todo())
+
+    def again(self) -> bool:
+        """Whether to train once more: what other processes were training may be free by now, or finished."""
+        busy, self.busy = self.busy, False
+        return busy and self.reuse()
 
     def _copy(self, source: str, items: list[Item]) -> None:
         points = points_of(self.tracker.rows([source])) if items else []
@@ -63,8 +81,8 @@ class Recorder:
             self.board.say(f"{item.name}: the same training was finished before; copied")
 
     def todo(self) -> list[Item]:
-        """One run for each training that is needed, in the order of the plan."""
-        return [items[0] for items in self.waiting.values()]
+        """One run for each training that is needed and did not fail, in the order of the plan."""
+        return [items[0] for items in self.waiting.values() if items[0].name not in self.failures]
 
     def start(self, key: str) -> None:
         """A training begins or continues."""
@@ -80,12 +98,19 @@ class Recorder:
 
     def result(self, key: str, result: dict[str, Any]) -> None:
         """New points of a training; the last ones finish its run."""
+        if error := result.get("error"):
+            self.failed(key, error, result["trace"])
+            return
         item, points = self.waiting[key][0], result["points"]
         self.logs[key].log(points)
         self.board.points(item.name, points)
         if result["stopped"]:
             self._end(key, "interrupted")
-            self.board.end(item.name, "stopped; the next launch continues it")
+            if result.get("busy"):
+                self.busy = True
+                self.board.end(item.name, "another process is training it; waiting for that")
+            else:
+                self.board.end(item.name, "stopped; the next launch continues it")
         elif result["done"]:
             self._finish(key)
 
@@ -96,6 +121,10 @@ class Recorder:
         self.board.end(items[0].name, "finished")
         self._copy(log.ref, items[1:])
         Checkpoints(folder).clear()
+
+    def died(self, key: str) -> None:
+        """The process that did a training is gone; another one will continue it."""
+        self.board.end(self.waiting[key][0].name, "its worker died; another one continues it")
 
     def failed(self, key: str, error: str, trace: str) -> None:
         """A training failed: keep why, go on with the others."""

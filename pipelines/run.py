@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 from rich.console import Console
 
@@ -25,7 +25,7 @@ from pipelines.tracker import Status, Tracker
 if TYPE_CHECKING:
     from pipelines.mlflow_tracker import MlflowTracker
 
-DONE, FAILED, BAD, INTERRUPTED = 0, 1, 2, 130  # exit codes
+DONE, FAILED, BAD, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143  # exit codes
 
 RAY_SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",
@@ -47,22 +47,75 @@ def run_study(study: Study, home: Path) -> int:
         home: the work folder.
 
     Returns:
-        0 all finished, 1 some run failed, 2 something is in the way, 130 interrupted. A second launch is always safe.
+        0 all finished, 1 some run failed, 2 something is in the way, 130 interrupted, 143 terminated. A second launch
+        is always safe.
     """
-    place = Home(home)
+    place, interrupts = Home(home), Interrupts()
     try:
-        place.prepare()
-        with place.lock(study.name, study.profile):
-            return _launch(study, place)
+        with interrupts:
+            place.prepare()
+            with place.lock(study.name, study.profile):
+                return _launch(study, place, interrupts)
     except StoreError as error:
         print(f"rhmc: {error}", file=sys.stderr)
         return BAD
     except KeyboardInterrupt:
         print("rhmc: interrupted; the same command continues", file=sys.stderr)
-        return INTERRUPTED
+        return interrupts.code
+    except SystemExit:  # Ray's answer to SIGTERM while it starts
+        print("rhmc: terminated; the same command continues", file=sys.stderr)
+        return TERMINATED
 
 
-def _launch(study: Study, home: Home) -> int:
+class Interrupts:
+    """What Ctrl-C and SIGTERM do: while runs train, the first asks each of them to save itself and end, the second
+    leaves at once; before and afterwards there is nothing to save, and the first leaves at once.
+
+    Attributes:
+        code: the exit code, 128 + the number of the signal; 130 before any came.
+        came: whether one came.
+    """
+
+    def __init__(self) -> None:
+        self.code, self.came = INTERRUPTED, False
+        self.stop: Path | None = None  # the file that asks
+        self.board: Board | None = None
+
+    def __enter__(self) -> Self:
+        self.before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+        self._listen()
+        return self
+
+    def _listen(self) -> None:
+        for number in self.before:
+            signal.signal(number, self._handle)
+
+    def __exit__(self, *exception: object) -> None:
+        for number, handler in self.before.items():
+            signal.signal(number, handler)
+
+    @contextmanager
+    def go_to(self, stop: Path, board: Board) -> Iterator[None]:
+        """While runs train that look for the file `stop`."""
+        self._listen()  # again: Ray, which has just started, takes SIGTERM for itself
+        self.stop, self.board = stop, board
+        try:
+            yield
+        finally:
+            self.stop = None
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        self.code, self.came = 128 + number, True
+        if self.stop is None or self.board is None or self.stop.exists():
+            raise KeyboardInterrupt
+        try:
+            self.stop.touch()
+        except OSError as error:  # a full disk
+            raise KeyboardInterrupt from error
+        self.board.say("interrupted: each run stops at its next point and saves itself; again to leave at once")
+
+
+def _launch(study: Study, home: Home, interrupts: Interrupts) -> int:
     from pipelines.mlflow_tracker import MlflowTracker  # 3 s: only when something is launched
 
     card = study_card(study)
@@ -74,21 +127,22 @@ def _launch(study: Study, home: Home) -> int:
             recorder = Recorder(card, plan, tracker, home, display)
             if recorder.skipped:
                 display.say(f"{recorder.skipped} of {len(plan)} runs were finished before")
-            recorder.reuse()
-            if recorder.left:
-                train(study, recorder, home)
+            left = recorder.reuse()
+            while left and not interrupts.came:
+                train(study, recorder, home, interrupts)
+                left = recorder.again()
         status = "failed" if recorder.failures else "interrupted" if recorder.left else "finished"
     finally:
         tracker.close(status)
     _summary(study, recorder, tracker)
-    return {"finished": DONE, "failed": FAILED}.get(status, INTERRUPTED)
+    return {"finished": DONE, "failed": FAILED}.get(status, interrupts.code)
 
 
 # Ray
 
 
-def train(study: Study, recorder: Recorder, home: Home) -> None:
-    """Train what the recorder still waits for.
+def train(study: Study, recorder: Recorder, home: Home, interrupts: Interrupts) -> None:
+    """Train what the recorder still waits for, but for what another study is training at this moment.
 
     Raises:
         StoreError: the log failed, or Ray cannot be reached.
@@ -111,8 +165,9 @@ def train(study: Study, recorder: Recorder, home: Home) -> None:
         }
         for item in recorder.todo()
     ]
+    cpus = study.resources.concurrent * study.resources.cpus
     try:
-        with ray_session(study.resources.concurrent * study.resources.cpus), interrupt_to(stop, recorder.board):
+        with ray_session(cpus, home.name(study.name, study.profile)), interrupts.go_to(stop, recorder.board):
             fit(jobs, recorder, scratch, study.resources.concurrent, study.resources.cpus, stop)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
@@ -121,24 +176,6 @@ def train(study: Study, recorder: Recorder, home: Home) -> None:
 def set_up_ray() -> None:
     """Ray reads its settings when it is imported."""
     os.environ.update({name: os.environ.get(name, value) for name, value in RAY_SETTINGS.items()})
-
-
-@contextmanager
-def interrupt_to(stop: Path, board: Board) -> Iterator[None]:
-    """The first Ctrl-C (or SIGTERM) asks every run to save itself and end; the second one leaves at once."""
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        if stop.exists():
-            raise KeyboardInterrupt
-        stop.touch()
-        board.say("interrupted: each run stops at its next point and saves itself; again to leave at once")
-
-    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 # What a person reads

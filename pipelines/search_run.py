@@ -22,7 +22,7 @@ from pipelines.fingerprint import fingerprint
 from pipelines.found import file_name, slug, winner_yaml, write_text
 from pipelines.plan import commit
 from pipelines.progress import Board, board, print_table
-from pipelines.run import BAD, DONE, FAILED, INTERRUPTED, interrupt_to, set_up_ray
+from pipelines.run import BAD, DONE, FAILED, TERMINATED, Interrupts, set_up_ray
 from pipelines.search import Search
 from pipelines.store import Checkpoints, Home, StoreError
 from pipelines.tracker import Card, RunLog, Status, StudyCard, Tracker
@@ -61,19 +61,23 @@ def run_search(search: Search, home: Path, out: Path | None = None) -> int:
             changed by overrides: a trial of the tool does not replace what was found in earnest.
 
     Returns:
-        0 every trial is finished or pruned, 1 some failed, 2 something is in the way, 130 interrupted.
+        0 every trial is finished or pruned, 1 some failed, 2 something is in the way, 130 interrupted, 143 terminated.
     """
-    place = Home(home)
+    place, interrupts = Home(home), Interrupts()
     try:
-        place.prepare()
-        with place.lock(search.name, search.profile):
-            return _launch(search, place, out or found_folder(search, place))
+        with interrupts:
+            place.prepare()
+            with place.lock(search.name, search.profile):
+                return _launch(search, place, out or found_folder(search, place), interrupts)
     except StoreError as error:
         print(f"rhmc: {error}", file=sys.stderr)
         return BAD
     except KeyboardInterrupt:
         print("rhmc: interrupted; the same command continues", file=sys.stderr)
-        return INTERRUPTED
+        return interrupts.code
+    except SystemExit:  # Ray's answer to SIGTERM while it starts
+        print("rhmc: terminated; the same command continues", file=sys.stderr)
+        return TERMINATED
 
 
 def found_folder(search: Search, home: Home) -> Path:
@@ -86,7 +90,7 @@ def plots_folder(search: Search, home: Home) -> Path:
     return home.root / "searches" / f"{search.name}-{search.profile}"
 
 
-def _launch(search: Search, home: Home, out: Path) -> int:
+def _launch(search: Search, home: Home, out: Path, interrupts: Interrupts) -> int:
     from pipelines.mlflow_tracker import MlflowTracker  # 3 s: only when something is launched
 
     code, url = fingerprint(), storage_url(home)
@@ -101,7 +105,7 @@ def _launch(search: Search, home: Home, out: Path) -> int:
                 again = ledger.take_up()
                 display.say(f"{ledger.arm}: {ledger.closed} of {search.trials} trials are done, {again} are taken up")
             if any(ledger.left for ledger in ledgers):
-                _train(search, ledgers, tracker, home, display, code)
+                _train(search, ledgers, Book(search, code, tracker, display), home, interrupts)
             whole = not any(ledger.left or ledger.live for ledger in ledgers)
             for ledger in ledgers if not whole else []:
                 ledger.take_up()
@@ -111,10 +115,10 @@ def _launch(search: Search, home: Home, out: Path) -> int:
     finally:
         tracker.close(status)
     _summary(search, ledgers, tracker, written, whole)
-    return {"finished": DONE, "failed": FAILED}.get(status, INTERRUPTED)
+    return {"finished": DONE, "failed": FAILED}.get(status, interrupts.code)
 
 
-def _train(search: Search, ledgers: Sequence[Ledger], tracker: Tracker, home: Home, display: Board, code: str) -> None:
+def _train(search: Search, ledgers: Sequence[Ledger], book: "Book", home: Home, interrupts: Interrupts) -> None:
     set_up_ray()
     from pipelines.pool import Pool
     from pipelines.ray_driver import ray_session  # 3 s
@@ -123,10 +127,10 @@ def _train(search: Search, ledgers: Sequence[Ledger], tracker: Tracker, home: Ho
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)
     stop, resources = scratch / "stop", search.resources
+    name = home.name(search.name, search.profile)
     try:
-        with ray_session(resources.concurrent * resources.cpus), interrupt_to(stop, display):
-            pool = Pool(resources.concurrent, resources.cpus)
-            Drive(search, ledgers, pool, Book(search, code, tracker, display), home, stop).run()
+        with ray_session(resources.concurrent * resources.cpus, name), interrupts.go_to(stop, book.board):
+            Drive(search, ledgers, Pool(resources.concurrent, resources.cpus), book, home, stop).run()
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
 

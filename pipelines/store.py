@@ -1,19 +1,21 @@
 """The work folder: where it is, who may write to a study, and checkpoints that survive a killed process."""
 
+import hashlib
 import os
 import shutil
+import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import torch
-from filelock import FileLock, Timeout
+from filelock import BaseFileLock, FileLock, Timeout
 
 from pipelines.errors import InputError
 from rhmc.types import State
 
-KEEP = 2  # checkpoints kept: should the newest be cut short, the one before is used
+KEEP = 2  # checkpoints kept: should the newest be damaged, the one before is used
 
 
 class StoreError(InputError):
@@ -45,6 +47,10 @@ class Home:
     def scratch(self, study: str, profile: str) -> Path:
         """What Ray writes while a study runs; worth nothing afterwards."""
         return self.root / "ray" / f"{study}-{profile}"
+
+    def name(self, study: str, profile: str) -> str:
+        """A short name of the study and profile in this folder, for what has to lie elsewhere."""
+        return hashlib.sha256(f"{self.root}\0{study}\0{profile}".encode()).hexdigest()[:12]
 
     def prepare(self) -> None:
         """Make the folder and see that it can be written to.
@@ -103,11 +109,15 @@ class Checkpoints:
             old.unlink(missing_ok=True)
 
     def newest(self) -> State | None:
-        """The newest checkpoint that can be read, or None. Unreadable ones are removed."""
+        """The newest checkpoint that is whole, or None. Damaged ones are removed, and what a killed writer left."""
+        for part in self.folder.glob("*.part"):
+            part.unlink(missing_ok=True)
         for file in self._files():
             try:
-                return torch.load(file, weights_only=True, map_location="cpu")
-            except Exception:  # cut short, or not a checkpoint: torch raises several kinds
+                return load_whole(file)
+            except MemoryError:
+                raise
+            except Exception:  # zipfile, pickle and torch each raise several kinds
                 file.unlink(missing_ok=True)
         return None
 
@@ -119,9 +129,19 @@ class Checkpoints:
     def _files(self) -> list[Path]:
         return sorted(self.folder.glob("[0-9]*.pt"), reverse=True)
 
+    def lock(self) -> BaseFileLock:
+        """Whoever trains the run holds it."""
+        return FileLock(f"{self.folder}.lock")
+
     def clear(self) -> None:
         """Remove the folder."""
         shutil.rmtree(self.folder, ignore_errors=True)
+
+    def clear_unused(self) -> None:
+        """Remove the folder, should there be one that no process trains in."""
+        if self.folder.is_dir():
+            with suppress(Timeout), self.lock().acquire(timeout=0):
+                self.clear()
 
 
 @contextmanager
@@ -140,10 +160,9 @@ def whole(path: Path, *, durable: bool = False) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield part
         if durable:
-            sync(part)
-        part.replace(path)
-        if durable:
-            sync(path.parent)
+            replace_durably(part, path)
+        else:
+            part.replace(path)
     except BaseException as error:
         with suppress(OSError):
             shutil.rmtree(part) if part.is_dir() else part.unlink(missing_ok=True)
@@ -162,8 +181,27 @@ def save_atomically(path: Path, state: Any) -> None:
         torch.save(state, file)
 
 
+def load_whole(path: Path) -> Any:
+    """What `save_atomically` wrote, or an exception of any kind.
+
+    `torch.load` alone does not see bytes that changed inside a tensor, such as a block that a power cut left as zeros;
+    the checksums that `torch.save` writes beside each tensor do.
+    """
+    with zipfile.ZipFile(path) as archive:
+        if damaged := archive.testzip():
+            raise zipfile.BadZipFile(f"{path}: {damaged} does not match its checksum")
+    return torch.load(path, weights_only=True, map_location="cpu")
+
+
+def replace_durably(part: Path, path: Path) -> None:
+    """Rename a closed file over another so that a power cut leaves the old one or the new one, whole."""
+    sync(part)
+    part.replace(path)
+    sync(path.parent)
+
+
 def sync(path: Path) -> None:
-    """Make what was written to a file, or renamed in a folder, durable."""
+    """Make the content of a file, or the names in a folder, durable."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -5,14 +5,16 @@ own checkpoints are therefore not used.
 """
 
 import time
+import traceback
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypedDict
 
-from filelock import FileLock, Timeout
+from filelock import Timeout
 from ray.tune import Trainable
 
 from pipelines.seeds import Seeds
-from pipelines.store import Checkpoints, StoreError, save_atomically, without_replay
+from pipelines.store import Checkpoints, StoreError, one_line, save_atomically, without_replay
 from pipelines.study import RunSpec
 from rhmc.trainer import Trainer
 from rhmc.types import Metrics, State
@@ -34,7 +36,9 @@ class RunTrainable(Trainable):
     """See the module. Configuration: `{"job": Job}`.
 
     A result has `done`, `stopped`, `seconds` and `points`: the new point of the grid, and at the first step of a
-    continued run every point before it as well, so that a log can be made whole.
+    continued run every point before it as well, so that a log can be made whole. `busy` is true where another process
+    is training this run. What goes wrong is a result as well, with `error` (one line) and `trace`: were it raised, Ray
+    could not be told to replace a worker that died and to leave alone one that failed.
     """
 
     def setup(self, config: dict[str, Any]) -> None:
@@ -43,20 +47,30 @@ class RunTrainable(Trainable):
         self.job = job
         self.stop_file = Path(job["stop"])
         self.checkpoints = Checkpoints(Path(job["folder"]))
-        self.lock = FileLock(f"{job['folder']}.lock")
+        self.lock = self.checkpoints.lock()
         self.trainer: Trainer | Seeds | None = None
         self.history: list[Metrics] = []
         self.seconds = 0.0
         self.reported = self.saved = 0  # points told to the driver; points in the newest checkpoint
-        if not self.stop_file.exists():
+        self.ended: dict[str, Any] = {}  # why there is nothing to train
+        if self.stop_file.exists():
+            self.ended = ending(stopped=True)
+            return
+        try:
             self._begin()
+        except Timeout:
+            self.ended = ending(stopped=True, busy=True)
+        except Exception as error:
+            self.ended = failure(error)
 
     def _begin(self) -> None:
         Path(self.job["folder"]).parent.mkdir(parents=True, exist_ok=True)
         try:
-            self.lock.acquire(timeout=PATIENCE)
-        except Timeout as error:
-            raise StoreError(f"{self.job['folder']}: another process is training this run") from error
+            self.lock.acquire(timeout=0)
+        except Timeout:
+            with suppress(Timeout), self.lock.acquire(timeout=PATIENCE):
+                pass
+            raise  # free now or not: whoever had it may have finished the run, so the driver looks first
         self.trainer = self.make_trainer()
         if state := self.checkpoints.newest():
             self.load_state(state)
@@ -68,13 +82,19 @@ class RunTrainable(Trainable):
 
     def step(self) -> dict[str, Any]:
         """Train to the next point."""
-        if self.trainer is None:
-            return {"done": True, "stopped": True, "points": [], "seconds": self.seconds}
-        if not self.trainer.done:
-            self._advance(self.trainer)
-        done, stopped = self.trainer.done, self.stop_file.exists()
+        if self.trainer is None or self.ended:
+            return self.ended
+        try:
+            return self._step(self.trainer)
+        except Exception as error:
+            return failure(error)
+
+    def _step(self, trainer: Trainer | Seeds) -> dict[str, Any]:
+        if not trainer.done:
+            self._advance(trainer)
+        done, stopped = trainer.done, self.stop_file.exists()
         if done or stopped or len(self.history) - self.saved >= self.job["checkpoint_every"]:
-            self._save()
+            self._save(trainer)
         points, self.reported = self.history[self.reported :], len(self.history)
         return {"done": done or stopped, "stopped": stopped and not done, "points": points, "seconds": self.seconds}
 
@@ -86,14 +106,12 @@ class RunTrainable(Trainable):
         timing = {"time/seconds": self.seconds, "time/steps_per_second": (trainer.step - before) / spent}
         self.history.append(metrics | timing)
 
-    def _save(self) -> None:
-        if len(self.history) == self.saved:
-            return
-        assert self.trainer is not None
+    def _save(self, trainer: Trainer | Seeds) -> None:
         state = self.state()
-        if self.trainer.done:
+        if trainer.done:  # also where nothing is left to train: the file that a killed worker left may be damaged
             save_atomically(self.checkpoints.folder / "policy.pt", without_replay(state["trainer"]))
-        self.checkpoints.save(len(self.history), state)
+        if len(self.history) > self.saved:
+            self.checkpoints.save(len(self.history), state)
         self.saved = len(self.history)
 
     def state(self) -> State:
@@ -129,3 +147,14 @@ class RunTrainable(Trainable):
         """Let go of the run."""
         self.trainer = None
         self.lock.release()
+
+
+def ending(*, stopped: bool = False, **more: Any) -> dict[str, Any]:
+    """A last result without points."""
+    return {"done": True, "stopped": stopped, "points": [], "seconds": 0.0} | more
+
+
+def failure(error: Exception) -> dict[str, Any]:
+    """The last result of a run that cannot go on."""
+    line = str(error) if isinstance(error, StoreError) else f"{type(error).__name__}: {one_line(error)}"
+    return ending(error=line, trace=traceback.format_exc())

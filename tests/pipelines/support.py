@@ -1,4 +1,4 @@
-"""A tiny study, also as a program: `python -m tests.pipelines.support HOME` launches it."""
+"""A tiny study, also as a program: `python -m tests.pipelines.support HOME POINTS` launches it."""
 
 import sys
 from pathlib import Path
@@ -54,4 +54,4 @@ if __name__ == "__main__":
     from pipelines import run
 
     run.fingerprint = lambda: CODE
-    sys.exit(run.run_study(tiny(points=30), Path(sys.argv[1])))
+    sys.exit(run.run_study(tiny(points=int(sys.argv[2])), Path(sys.argv[1])))

@@ -1,4 +1,7 @@
-"""A driver that is killed or interrupted, as a process of its own; the next launch must end where one launch would."""
+"""A driver that is killed or interrupted, as a process of its own; the next launch must end where one launch would.
+
+The same for its workers, which are Ray's here; more kills, without Ray, are in `test_faults.py`.
+"""
 
 import os
 import shutil
@@ -7,8 +10,10 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
+import psutil
 import pytest
 
 from pipelines.export import export_study
@@ -19,7 +24,8 @@ from pipelines.store import Home
 from tests.pipelines.support import CODE, tiny
 
 pytestmark = pytest.mark.ray
-STUDY = tiny(points=30)
+POINTS = 30
+STUDY = tiny(points=POINTS)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -43,7 +49,7 @@ def uninterrupted(tmp_path_factory: pytest.TempPathFactory, template: Path, clus
 
 def driver(home: Path) -> subprocess.Popen[str]:
     """Launch the study in a process of its own and wait for its first checkpoint."""
-    command = [sys.executable, "-W", "ignore", "-m", "tests.pipelines.support", str(home)]
+    command = [sys.executable, "-W", "ignore", "-m", "tests.pipelines.support", str(home), str(POINTS)]
     root = Path(__file__).parents[2]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
     process = subprocess.Popen(command, cwd=root, text=True, **pipes, start_new_session=True)
@@ -54,6 +60,25 @@ def driver(home: Path) -> subprocess.Popen[str]:
         time.sleep(0.05)
     os.killpg(process.pid, signal.SIGKILL)
     raise AssertionError(process.communicate()[0])
+
+
+def started_by(driver: int, name: str = "") -> list[psutil.Process]:
+    """What runs in the session of a driver, which may be gone, and has `name` in its command line."""
+    found = []
+    for process in psutil.process_iter():
+        with suppress(psutil.Error, OSError):
+            if os.getsid(process.pid) == driver and process.status() != psutil.STATUS_ZOMBIE:
+                found += [process] if name in " ".join(process.cmdline()) else []
+    return found
+
+
+def all_end(driver: int) -> bool:
+    """Whether nothing that a driver started is left within a minute."""
+    for _ in range(600):
+        if not started_by(driver):
+            return True
+        time.sleep(0.1)
+    return False
 
 
 def statuses(home: Path) -> dict[str, str]:
@@ -76,7 +101,7 @@ def finish(home: Path, expected: bytes) -> None:
     assert tracker is not None
     for ref in after:
         history = tracker.client.get_metric_history(ref, "eval/return")
-        assert sorted(value.step for value in history) == [200 * k for k in range(31)]
+        assert sorted(value.step for value in history) == [200 * k for k in range(POINTS + 1)]
     assert not list(home.glob("checkpoints/*/*.pt"))
 
 
@@ -84,6 +109,7 @@ def test_a_killed_driver(home: Path, uninterrupted: bytes) -> None:
     process = driver(home)
     process.kill()
     process.communicate()
+    assert all_end(process.pid)
     assert "running" in statuses(home).values()  # nobody was left to say otherwise
     finish(home, uninterrupted)
 
@@ -97,4 +123,29 @@ def test_an_interrupted_driver(home: Path, uninterrupted: bytes) -> None:
     assert "Traceback" not in out
     assert set(statuses(home).values()) <= {"interrupted", "finished"}
     assert not list(home.glob("checkpoints/*/*.part"))
+    finish(home, uninterrupted)
+
+
+def newest(home: Path) -> int:
+    """The last point that was saved, of the run that is furthest."""
+    return max((int(file.stem) for file in home.glob("checkpoints/*/0*.pt")), default=0)
+
+
+def test_killed_workers_and_a_terminated_driver(home: Path, uninterrupted: bytes) -> None:
+    process = driver(home)
+    workers = started_by(process.pid, "ray::RunTrainable")
+    assert workers
+    for worker in workers:
+        worker.kill()
+    time.sleep(0.1)  # what was being written is written
+    points = newest(home)
+    while process.poll() is None and newest(home) <= points:  # until another worker went on
+        time.sleep(0.02)
+    process.send_signal(signal.SIGTERM)
+    out = process.communicate(timeout=600)[0]
+    assert process.returncode == 143, out
+    assert "its worker died; another one continues it" in out
+    assert "failed" not in out
+    assert "Traceback" not in out
+    assert all_end(process.pid)
     finish(home, uninterrupted)

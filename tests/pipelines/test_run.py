@@ -2,31 +2,37 @@
 
 import io
 import os
+import signal
 import socket
+import sys
 import threading
 from collections.abc import Callable
+from contextlib import nullcontext
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from filelock import FileLock
 from rich.console import Console
 from ruamel.yaml import YAML
 
-from pipelines import progress
+from pipelines import progress, ray_driver, run, trainable
 from pipelines.export import export_study
 from pipelines.fingerprint import fingerprint
 from pipelines.mlflow_tracker import open_existing
 from pipelines.plan import Item, study_card, what_varies
 from pipelines.progress import LiveBoard, PlainBoard, duration
-from pipelines.ray_driver import _knock
+from pipelines.ray_driver import _knock, sockets
 from pipelines.recorder import Recorder
-from pipelines.run import _arguments, run_study, show_status
+from pipelines.run import Interrupts, _arguments, run_study, show_status
 from pipelines.store import Checkpoints, Home, StoreError
 from pipelines.study import Study
 from pipelines.tracker import MemoryRun, MemoryTracker, StudyCard, points_of
 from rhmc.algorithms import iql
 from rhmc.trainer import Trainer
+from tests.pipelines.chaos import fit_here
 from tests.pipelines.support import plan, setting, spec, tiny
 
 STUDY = StudyCard("tiny", "quick", "")
@@ -152,6 +158,39 @@ def test_a_failure_is_kept_and_tried_again(launch: Launch, shelf: list[MemoryRun
     assert (shelf[0].status, shelf[0].tags["error"]) == ("failed", "ValueError: no")
     assert shelf[0].files["error.txt"].startswith(b"Traceback")
     assert launch().todo()[0].key == key
+
+
+def test_a_failure_that_a_worker_tells_is_kept(launch: Launch, shelf: list[MemoryRun]) -> None:
+    recorder = launch()
+    key = recorder.todo()[0].key
+    recorder.start(key)
+    recorder.result(key, {"done": True, "stopped": False, "points": [], "error": "boom", "trace": "Traceback"})
+    assert (shelf[0].status, shelf[0].tags["error"]) == ("failed", "boom")
+    assert key not in [item.key for item in recorder.todo()]  # not again in this launch
+    assert recorder.left == 2
+
+
+def test_what_another_process_trains_is_waited_for(launch: Launch, shelf: list[MemoryRun]) -> None:
+    recorder = launch()
+    key, free = [item.key for item in recorder.todo()]
+    recorder.start(key)
+    recorder.result(key, {"done": True, "stopped": True, "busy": True, "points": []})
+    step(recorder, free, stopped=True)
+    assert [run.status for run in shelf] == ["interrupted", "interrupted"]
+    assert recorder.again()
+    assert not recorder.again()  # asked for once
+
+
+def test_checkpoints_that_a_killed_launch_left_of_a_finished_run_go(launch: Launch) -> None:
+    recorder = launch()
+    key, other = [item.key for item in recorder.todo()]
+    step(recorder, key)
+    finish(recorder, key)
+    for folder in (key, other):
+        recorder.home.checkpoints(folder).mkdir(parents=True)
+    again = launch()
+    assert not again.home.checkpoints(key).exists()
+    assert again.home.checkpoints(other).exists()
 
 
 def test_arms_that_are_the_same_run_are_trained_once(launch: Launch, shelf: list[MemoryRun]) -> None:
@@ -302,7 +341,82 @@ def test_the_status_before_anything_ran(tmp_path: Path, capsys: pytest.CaptureFi
     assert list(tmp_path.iterdir()) == []
 
 
+# Signals
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_outside_training_ends_the_launch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals, code: int
+) -> None:
+    monkeypatch.setattr(run, "_launch", lambda *args: signal.raise_signal(number))
+    before = signal.getsignal(number)
+    assert run_study(tiny(), tmp_path) == code
+    assert signal.getsignal(number) is before
+    with Home(tmp_path).lock("tiny", "quick"):
+        pass  # let go of
+
+
+def test_rays_own_answer_to_sigterm_ends_the_launch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run, "_launch", lambda *args: sys.exit(15))
+    assert run_study(tiny(), tmp_path) == 143
+
+
+def test_the_first_signal_in_training_asks_and_the_second_ends(launch: Launch, tmp_path: Path) -> None:
+    stop, recorder = tmp_path / "stop", launch()
+    with Interrupts() as interrupts:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # as Ray does when it starts
+        with interrupts.go_to(stop, recorder.board):
+            assert not interrupts.came
+            signal.raise_signal(signal.SIGTERM)
+            assert (interrupts.came, interrupts.code, stop.exists()) == (True, 143, True)
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+    assert interrupts.code == 130
+
+
+def test_a_signal_on_a_full_disk_ends_the_launch(launch: Launch, tmp_path: Path) -> None:
+    recorder = launch()
+    with (
+        Interrupts() as interrupts,
+        interrupts.go_to(tmp_path / "none" / "stop", recorder.board),
+        pytest.raises(KeyboardInterrupt),
+    ):
+        signal.raise_signal(signal.SIGINT)
+
+
+def test_the_folder_of_a_killed_driver_is_used_again() -> None:
+    with sockets("test-of-sockets") as folder:
+        (folder / "left").touch()
+        with sockets("test-of-sockets") as same:
+            assert same == folder
+            assert list(same.iterdir()) == []
+    assert not folder.exists()
+
+
 # The whole chain
+
+
+def test_a_run_that_another_process_trains_is_trained_when_that_lets_go(
+    home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    launches = []
+
+    def fit(jobs: list[dict[str, Any]], *rest: Any) -> None:
+        launches.append([job["key"] for job in jobs])
+        if len(launches) == 2:
+            held.release()
+        fit_here(jobs, *rest)
+
+    monkeypatch.setattr(trainable, "PATIENCE", 0.0)
+    monkeypatch.setattr(ray_driver, "fit", fit)
+    monkeypatch.setattr(ray_driver, "ray_session", lambda *args: nullcontext())
+    key = f"{tiny().runs()[0].spec.id}-{fingerprint()}"
+    Home(home).checkpoints(key).parent.mkdir()
+    held = FileLock(f"{Home(home).checkpoints(key)}.lock")
+    held.acquire()
+    assert run_study(tiny(), home) == 0
+    assert launches == [[key, launches[0][1]], [key]]
+    assert "slow s0: another process is training it; waiting for that" in capsys.readouterr().out
 
 
 @pytest.mark.ray

@@ -187,6 +187,47 @@ def test_a_retried_run_forgets_its_error(home: Path) -> None:
     assert "error" not in tracker.client.get_run(run.ref).data.tags
 
 
+def test_a_run_that_a_dying_server_made_twice_is_kept_once(home: Path) -> None:
+    tracker = MlflowTracker(STUDY, Home(home))
+    for _ in range(2):
+        tracker._create("full s3", tracker._tags(CARD))
+        tracker._create("demo", {"role": "study"})
+    run = tracker.start(CARD)
+    run.log([point(0)])
+    assert [(one.ref, one.status) for one in tracker.recorded()] == [(run.ref, "running")]
+    again = MlflowTracker(STUDY, Home(home))
+    assert again.parent == tracker.parent
+    assert len(again._search("tags.role = 'study'")) == 1
+    assert again.start(CARD).ref == run.ref
+
+
+def test_params_that_a_killed_driver_did_not_write_are_filled_in(home: Path) -> None:
+    tracker = MlflowTracker(STUDY, Home(home))
+    made = tracker._create("full s3", tracker._tags(CARD))
+    run = tracker.start(CARD)
+    assert run.ref == made.info.run_id
+    assert tracker.client.get_run(run.ref).data.params == CARD.params
+
+
+def test_an_experiment_whose_making_was_asked_for_twice(home: Path) -> None:
+    tracker = MlflowTracker(STUDY, Home(home))
+    assert tracker._create_experiment("demo (quick)", None) == tracker.experiment
+
+
+def test_files_are_durable_before_a_run_is_finished(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tracker = MlflowTracker(STUDY, Home(home))
+    run = tracker.start(CARD)
+    run.text("config.yaml", "a: 1")
+    seen = []
+    monkeypatch.setattr(mlflow_tracker, "sync", lambda path: seen.append((path.name, tracker.recorded()[0].status)))
+    run.finish("interrupted")
+    assert seen == []
+    run.finish("finished")
+    assert ("config.yaml", "interrupted") in seen
+    assert {"artifacts", run.ref} <= {name for name, _ in seen}
+    assert {status for _, status in seen} == {"interrupted"}
+
+
 def test_reading_at_once_and_through_the_client_agree(home: Path) -> None:
     tracker = MlflowTracker(STUDY, Home(home))
     runs = [tracker.start(CARD._replace(seed=seed, spec_id=f"s{seed}")) for seed in range(3)]

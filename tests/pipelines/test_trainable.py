@@ -1,5 +1,6 @@
 """A run as a Ray trial, driven by hand: no Ray is started."""
 
+import random
 import resource
 from collections.abc import Callable
 from pathlib import Path
@@ -8,10 +9,12 @@ from typing import Any
 import pytest
 import torch
 
-from pipelines.store import Checkpoints, StoreError, save_atomically, without_replay
+from pipelines import store
+from pipelines.store import Checkpoints, StoreError, load_whole, save_atomically, without_replay
 from pipelines.trainable import RunTrainable
 from rhmc.algorithms import ALGORITHMS
 from rhmc.trainer import Trainer
+from tests.pipelines.chaos import DAMAGES, damaged
 from tests.pipelines.support import setting, spec
 
 Start = Callable[..., RunTrainable]
@@ -91,7 +94,8 @@ def test_a_run_whose_end_was_never_logged_only_tells_its_history(start: Start) -
     assert points([result]) == expected
 
 
-def test_a_truncated_checkpoint_falls_back_to_the_one_before(start: Start, tmp_path: Path) -> None:
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_checkpoint_falls_back_to_the_one_before(start: Start, tmp_path: Path, damage: str) -> None:
     expected = points(finish(start("whole")))
     first = start()
     for _ in range(3):
@@ -99,10 +103,70 @@ def test_a_truncated_checkpoint_falls_back_to_the_one_before(start: Start, tmp_p
     first.cleanup()
     files = sorted((tmp_path / "a" / "run0").glob("0*.pt"))
     assert [file.stem for file in files] == ["00000002", "00000003"]
-    files[1].write_bytes(files[1].read_bytes()[:1000])
+    files[1].write_bytes(damaged(files[1].read_bytes(), damage, random.Random(1)))
+    (tmp_path / "a" / "run0" / "00000004.77.part").write_bytes(b"half")  # of a killed writer
     results = finish(start())
     assert len(results[0]["points"]) == 3  # two from the checkpoint and the new one
     assert points(results) == expected
+    assert not list((tmp_path / "a" / "run0").glob("*.part"))
+
+
+def test_two_damaged_checkpoints_are_a_new_start(start: Start, tmp_path: Path) -> None:
+    expected = points(finish(start("whole")))
+    first = start()
+    for _ in range(3):
+        first.step()
+    first.cleanup()
+    for file in (tmp_path / "a" / "run0").glob("0*.pt"):
+        file.write_bytes(b"")
+    assert points(finish(start())) == expected
+
+
+def test_any_changed_block_of_a_checkpoint_is_seen(tmp_path: Path) -> None:
+    save_atomically(tmp_path / "x.pt", {"a": torch.arange(500.0), "b": [1, 2.5], "c": torch.ones(40, dtype=torch.bool)})
+    content, rng = (tmp_path / "x.pt").read_bytes(), random.Random(2)
+    whole, unseen = load_whole(tmp_path / "x.pt"), 0
+    for start in range(0, len(content) - 64, 64):
+        (tmp_path / "x.pt").write_bytes(content[:start] + rng.randbytes(64) + content[start + 64 :])
+        try:
+            unseen += not same(load_whole(tmp_path / "x.pt"), whole)
+        except Exception:
+            continue
+    assert unseen == 0
+
+
+def test_a_damaged_policy_is_written_again(start: Start, tmp_path: Path) -> None:
+    finish(first := start())
+    first.cleanup()
+    policy = tmp_path / "a" / "run0" / "policy.pt"
+    whole = torch.load(policy, weights_only=True)
+    policy.write_bytes(policy.read_bytes()[:100])
+    start().step()
+    assert same(torch.load(policy, weights_only=True), whole)
+
+
+def test_a_failure_is_a_result(start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*args: object) -> None:
+        raise StoreError("x.pt: cannot be written: No space left on device")
+
+    run = start()
+    with monkeypatch.context() as patch:
+        patch.setattr(Checkpoints, "save", full)
+        result = run.step()
+    assert (result["done"], result["error"]) == (True, "x.pt: cannot be written: No space left on device")
+    assert "Traceback" in result["trace"]
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "run0").touch()  # a file where the folder should be
+    result = start("b").step()
+    assert result["done"]
+    assert str(tmp_path / "b" / "run0") in result["error"]
+
+
+def test_a_file_is_durable_before_its_name_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[tuple[str, bool]] = []
+    monkeypatch.setattr(store, "sync", lambda path: seen.append((path.name, (tmp_path / "x.pt").exists())))
+    save_atomically(tmp_path / "x.pt", 1)
+    assert [(name.split(".")[-1], there) for name, there in seen] == [("part", False), (tmp_path.name, True)]
 
 
 def test_checkpoints_come_as_often_as_asked_and_at_the_end(start: Start, tmp_path: Path) -> None:
@@ -183,8 +247,7 @@ def test_a_process_goes_on_with_the_next_run(start: Start, tmp_path: Path) -> No
 def test_a_run_is_trained_by_one_process_at_a_time(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pipelines.trainable.PATIENCE", 0.0)
     run = start()
-    with pytest.raises(StoreError, match="another process is training this run"):
-        start()
+    assert start().step() == {"done": True, "stopped": True, "busy": True, "points": [], "seconds": 0.0}
     run.cleanup()
     assert len(start().step()["points"]) == 1
 
