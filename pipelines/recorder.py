@@ -5,10 +5,15 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from pipelines.overview import Overview
 from pipelines.plan import Item, finished, resolved_yaml
+from pipelines.policy import CONFIG, FILE
 from pipelines.progress import Board
+from pipelines.render import EPISODE, WHY_NOT
 from pipelines.store import Checkpoints, Home
 from pipelines.tracker import RunLog, Status, StudyCard, Tracker, points_of
+
+KEPT = (FILE, EPISODE, WHY_NOT)  # of what a training leaves in its folder
 
 
 class Recorder:
@@ -34,6 +39,8 @@ class Recorder:
             if (item.card.arm, item.key) not in done:
                 self.waiting[item.key].append(item)
         self.skipped = len(plan) - self.left
+        self.overview = Overview(study, plan, tracker)
+        self.overview.describe()
 
     @property
     def left(self) -> int:
@@ -53,12 +60,16 @@ class Recorder:
         for item in items:
             log = self.tracker.start(item.card)
             log.log(points)
-            log.text("config.yaml", resolved_yaml(item, self.study))
+            log.text(CONFIG, resolved_yaml(item, self.study))
             with TemporaryDirectory() as folder:
-                if policy := self.tracker.file(source, "policy.pt", Path(folder)):
-                    log.artifact(policy)
+                for name in KEPT:
+                    self.tracker.file(source, name, Path(folder))
+                (Path(folder) / CONFIG).write_text(resolved_yaml(item, self.study))  # for a policy without its spec
+                keep(log, Path(folder))
             log.tag("reused_from", source)
             log.finish("finished")
+            self.overview.points(item.card.arm, item.key, points)
+            self.overview.ended(item.card.arm, item.key, "finished")
             self.board.say(f"{item.name}: the same training was finished before; copied")
 
     def todo(self) -> list[Item]:
@@ -69,7 +80,7 @@ class Recorder:
         """A training begins or continues."""
         item = self.waiting[key][0]
         self.logs[key] = self.tracker.start(item.card)
-        self.logs[key].text("config.yaml", resolved_yaml(item, self.study))
+        self.logs[key].text(CONFIG, resolved_yaml(item, self.study))
         self.board.start(item.name, item.spec.trainer.steps)
 
     def result(self, key: str, result: dict[str, Any]) -> None:
@@ -77,16 +88,17 @@ class Recorder:
         item, points = self.waiting[key][0], result["points"]
         self.logs[key].log(points)
         self.board.points(item.name, points)
+        self.overview.points(item.card.arm, key, points)
         if result["stopped"]:
-            self._end(key, "interrupted")
+            self._end(item, "interrupted")
             self.board.end(item.name, "stopped; the next launch continues it")
         elif result["done"]:
             self._finish(key)
 
     def _finish(self, key: str) -> None:
         log, items, folder = self.logs[key], self.waiting.pop(key), self.home.checkpoints(key)
-        log.artifact(folder / "policy.pt")
-        self._end(key, "finished")
+        keep(log, folder)
+        self._end(items[0], "finished")
         self.board.end(items[0].name, "finished")
         self._copy(log.ref, items[1:])
         Checkpoints(folder).clear()
@@ -100,8 +112,18 @@ class Recorder:
         log = self.logs[key]
         log.tag("error", error)
         log.text("error.txt", trace)
-        self._end(key, "failed")
+        self._end(item, "failed")
         self.board.end(item.name, f"failed: {error}")
 
-    def _end(self, key: str, status: Status) -> None:
-        self.logs.pop(key).finish(status)
+    def _end(self, item: Item, status: Status) -> None:
+        self.logs.pop(item.key).finish(status)
+        self.overview.ended(item.card.arm, item.key, status)
+
+
+def keep(log: RunLog, folder: Path) -> None:
+    """Keep what a finished training left in a folder, and offer its policy as a model."""
+    for name in KEPT:
+        if (folder / name).exists():
+            log.artifact(folder / name)
+    if (folder / FILE).exists():
+        log.model(folder / FILE)

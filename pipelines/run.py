@@ -76,6 +76,7 @@ def _launch(study: Study, home: Home) -> int:
             recorder.reuse()
             if recorder.left:
                 train(study, recorder, home)
+            recorder.overview.publish()
         status = "failed" if recorder.failures else "interrupted" if recorder.left else "finished"
     finally:
         tracker.close(status)
@@ -100,6 +101,7 @@ def train(study: Study, recorder: Recorder, home: Home) -> None:
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)
     stop = scratch / "stop"
+    drawn = animated(study, recorder.plan)
     jobs = [
         {
             "key": item.key,
@@ -107,6 +109,7 @@ def train(study: Study, recorder: Recorder, home: Home) -> None:
             "folder": str(home.checkpoints(item.key)),
             "checkpoint_every": study.resources.checkpoint_every,
             "stop": str(stop),
+            "animate": item.key in drawn,
         }
         for item in recorder.todo()
     ]
@@ -115,6 +118,14 @@ def train(study: Study, recorder: Recorder, home: Home) -> None:
             fit(jobs, recorder, scratch, study.resources.concurrent, study.resources.cpus, stop)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+
+
+def animated(study: Study, plan: list[Item]) -> set[str]:
+    """Keys of the trainings that leave an animation: by default the first seed of every arm."""
+    first: dict[str, str] = {}
+    for item in plan:
+        first.setdefault(item.card.arm, item.key)
+    return {"none": set[str](), "first": set(first.values()), "all": {i.key for i in plan}}[study.resources.animate]
 
 
 @contextmanager

@@ -10,7 +10,7 @@ import json
 from collections.abc import Iterable, Sequence
 from functools import reduce
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Literal, NamedTuple, Self
 
 from pydantic import BaseModel, Field, field_validator
 
@@ -82,6 +82,7 @@ class Resources(Frozen):
     concurrent: int = Field(2, ge=1, description="runs at a time")
     cpus: int = Field(1, ge=1, description="processors of a run")
     checkpoint_every: int = Field(10, ge=1, description="points of the evaluation grid between checkpoints")
+    animate: Literal["first", "all", "none"] = Field("first", description="seeds whose runs keep an animated episode")
 
 
 class Study(Frozen):
