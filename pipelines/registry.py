@@ -1,5 +1,6 @@
 """Trained policies as models in MLflow's registry: one name per study, profile and arm, one version per run."""
 
+import json
 import re
 import warnings
 from pathlib import Path
@@ -13,6 +14,7 @@ from mlflow.entities import LoggedModel, LoggedModelOutput
 from mlflow.exceptions import MlflowException
 from mlflow.models import Model, ModelSignature
 from mlflow.types import ColSpec, Schema, TensorSpec
+from mlflow.utils.mlflow_tags import MLFLOW_MODEL_VERSIONS
 
 from pipelines.policy import FILE, load, save, sizes
 from pipelines.study import RunSpec
@@ -59,12 +61,17 @@ def register(client: MlflowClient, run: str, experiment: str, study: StudyCard, 
             raise
     made = client.create_model_version(name, model.artifact_location, run, tags, model_id=model.model_id)
     client.set_registered_model_alias(name, f"seed-{card.seed}", made.version)
+    versions = [{"name": name, "version": made.version}]
+    client.set_logged_model_tags(model.model_id, {MLFLOW_MODEL_VERSIONS: json.dumps(versions)})
 
 
 def _logged(
     client: MlflowClient, run: str, experiment: str, name: str, tags: dict[str, str], policy: Path
 ) -> LoggedModel:
-    """Keep the model's files in the store, as an output of the run."""
+    """Keep the model's files in the store, as an output of the run; the one that is there already, if so."""
+    outputs = client.get_run(run).outputs
+    if outputs and outputs.model_outputs:  # kept by a launch that was killed before it could register it
+        return client.get_logged_model(outputs.model_outputs[0].model_id)
     saved = load(policy)
     spec = saved.spec
     made = client.create_logged_model(experiment, name, run, tags, model_type="policy")

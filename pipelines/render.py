@@ -71,8 +71,8 @@ def play(env: EnvConfig, act: Act, episode: int) -> list[Scene]:
 
 
 def _told(score: dict[str, Tensor]) -> dict[str, Tensor]:
-    names = ("coverage", "landmarks_covered", "collisions")
-    return {name: score[name] for name in ("return", *names) if name in score}
+    names = ("return", "coverage", "landmarks_covered", "collisions")
+    return {name: score[name] for name in names if name in score}
 
 
 def _words(name: str, value: float) -> str:
@@ -121,6 +121,7 @@ def render(what: str, out: Path, home: Home, episode: int = 0, beside: str | Non
     else:
         with TemporaryDirectory() as folder:
             saved = policy.load(_fetch(what, home, Path(folder)))
+    torch.set_num_threads(saved.spec.trainer.threads)  # the actions of larger layers depend on it
     write(out, episode_gif(saved, episode, beside, frames))
     return out
 
