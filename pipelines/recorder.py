@@ -32,6 +32,7 @@ class Recorder:
     def __init__(self, study: StudyCard, plan: list[Item], tracker: Tracker, home: Home, board: Board) -> None:
         self.study, self.plan, self.tracker, self.home, self.board = study, plan, tracker, home, board
         self.logs: dict[str, RunLog] = {}
+        self.arms: dict[str, str] = {}  # of the runs that were started, by key
         self.failures: dict[str, str] = {}  # name of the run -> one line
         self.waiting: dict[str, list[Item]] = defaultdict(list)
         done = finished(tracker.recorded())
@@ -79,6 +80,7 @@ class Recorder:
     def start(self, key: str) -> None:
         """A training begins or continues."""
         item = self.waiting[key][0]
+        self.arms[key] = item.card.arm
         self.logs[key] = self.tracker.start(item.card)
         self.logs[key].text(CONFIG, resolved_yaml(item, self.study))
         self.board.start(item.name, item.spec.trainer.steps)
@@ -90,7 +92,7 @@ class Recorder:
         self.board.points(item.name, points)
         self.overview.points(item.card.arm, key, points)
         if result["stopped"]:
-            self._end(item, "interrupted")
+            self._end(key, "interrupted")
             self.board.end(item.name, "stopped; the next launch continues it")
         elif result["done"]:
             self._finish(key)
@@ -98,7 +100,7 @@ class Recorder:
     def _finish(self, key: str) -> None:
         log, items, folder = self.logs[key], self.waiting.pop(key), self.home.checkpoints(key)
         keep(log, folder)
-        self._end(items[0], "finished")
+        self._end(key, "finished")
         self.board.end(items[0].name, "finished")
         self._copy(log.ref, items[1:])
         Checkpoints(folder).clear()
@@ -112,12 +114,12 @@ class Recorder:
         log = self.logs[key]
         log.tag("error", error)
         log.text("error.txt", trace)
-        self._end(item, "failed")
+        self._end(key, "failed")
         self.board.end(item.name, f"failed: {error}")
 
-    def _end(self, item: Item, status: Status) -> None:
-        self.logs.pop(item.key).finish(status)
-        self.overview.ended(item.card.arm, item.key, status)
+    def _end(self, key: str, status: Status) -> None:
+        self.logs.pop(key).finish(status)
+        self.overview.ended(self.arms[key], key, status)
 
 
 def keep(log: RunLog, folder: Path) -> None:

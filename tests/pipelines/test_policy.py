@@ -178,6 +178,25 @@ def test_a_registered_policy_acts_in_a_fresh_process_as_the_trainer_evaluates(ho
     assert all(torch.equal(given, wanted) for given, wanted in zip(actions, done, strict=True))
 
 
+def test_a_model_that_a_killed_launch_left_unregistered_is_taken_up(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def killed(*args: object, **options: object) -> None:
+        raise KeyboardInterrupt
+
+    one = run("iql")
+    policy.save(tmp_path / "policy.pt", Saved(one, made(one).state_dict()["algorithm"]))
+    tracker = MlflowTracker(STUDY, Home(home))
+    log = tracker.start(CARD)
+    with monkeypatch.context() as patch:
+        patch.setattr(tracker.client, "create_model_version", killed)
+        with pytest.raises(KeyboardInterrupt):
+            log.model(tmp_path / "policy.pt")
+    log.model(tmp_path / "policy.pt")
+    (version,) = tracker.client.search_model_versions()
+    assert [output.model_id for output in tracker.client.get_run(log.ref).outputs.model_outputs] == [version.model_id]
+
+
 def test_a_policy_that_cannot_be_read_is_a_fault_of_the_store(home: Path, tmp_path: Path) -> None:
     (tmp_path / "policy.pt").write_bytes(b"weights")
     tracker = MlflowTracker(STUDY, Home(home))
