@@ -13,7 +13,7 @@ from pipelines.render import EPISODE, WHY_NOT
 from pipelines.store import Checkpoints, Home
 from pipelines.tracker import RunLog, Status, StudyCard, Tracker, points_of
 
-KEPT = (FILE, EPISODE, WHY_NOT)  # of what a training leaves in its folder
+EXTRAS = (EPISODE, WHY_NOT)  # what a training may leave beside its policy
 
 
 class Recorder:
@@ -63,10 +63,11 @@ class Recorder:
             log.log(points)
             log.text(CONFIG, resolved_yaml(item, self.study))
             with TemporaryDirectory() as folder:
-                for name in KEPT:
+                for name in EXTRAS:
                     self.tracker.file(source, name, Path(folder))
                 (Path(folder) / CONFIG).write_text(resolved_yaml(item, self.study))  # for a policy without its spec
-                keep(log, Path(folder))
+                if self.tracker.file(source, FILE, Path(folder)):
+                    keep(log, Path(folder))
             log.tag("reused_from", source)
             log.finish("finished")
             self.overview.points(item.card.arm, item.key, points)
@@ -124,8 +125,8 @@ class Recorder:
 
 def keep(log: RunLog, folder: Path) -> None:
     """Keep what a finished training left in a folder, and offer its policy as a model."""
-    for name in KEPT:
+    log.artifact(folder / FILE)
+    for name in EXTRAS:
         if (folder / name).exists():
             log.artifact(folder / name)
-    if (folder / FILE).exists():
-        log.model(folder / FILE)
+    log.model(folder / FILE)

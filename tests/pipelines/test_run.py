@@ -55,7 +55,7 @@ def launch(shelf: list[MemoryRun], tmp_path: Path) -> Launch:
 def finish(recorder: Recorder, key: str) -> None:
     """What a worker does at its end."""
     folder = recorder.home.checkpoints(key)
-    folder.mkdir(parents=True)
+    folder.mkdir(parents=True, exist_ok=True)
     (folder / "policy.pt").write_bytes(b"weights")
     recorder.result(key, {"done": True, "stopped": False, "points": POINTS[1:]})
 
@@ -133,6 +133,8 @@ def test_what_another_study_finished_is_copied(launch: Launch, shelf: list[Memor
     other = launch(study=STUDY._replace(study="other"))
     key = other.todo()[0].key
     step(other, key)
+    other.home.checkpoints(key).mkdir(parents=True)
+    (other.home.checkpoints(key) / "episode.gif").write_bytes(b"GIF89a")
     finish(other, key)
     recorder = launch()
     recorder.reuse()
@@ -140,6 +142,8 @@ def test_what_another_study_finished_is_copied(launch: Launch, shelf: list[Memor
     assert [(run.study.study, run.status) for run in shelf] == [("other", "finished"), ("tiny", "finished")]
     assert points_of(shelf[1].values) == POINTS
     assert shelf[1].files["policy.pt"] == shelf[0].files["policy.pt"] == b"weights"
+    assert shelf[1].models == shelf[0].models == [b"weights"]
+    assert shelf[1].files["episode.gif"] == b"GIF89a"
 
 
 def test_other_code_is_another_run(launch: Launch) -> None:
