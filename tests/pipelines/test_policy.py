@@ -167,7 +167,7 @@ def test_a_registered_policy_acts_in_a_fresh_process_as_the_trainer_evaluates(ho
     versions = tracker.client.search_model_versions(f"name = '{version.name}'")
     assert sorted(int(v.version) for v in versions) == [1, 2]
     outputs = tracker.client.get_run(log.ref).outputs.model_outputs
-    assert [output.model_id for output in outputs] == [version.model_id]
+    assert [f"/{output.model_id}/" in version.source for output in outputs] == [True]
 
     seen, done = episode(trainer)
     torch.save([obs._asdict() for obs in seen], tmp_path / "seen.pt")
@@ -194,7 +194,8 @@ def test_a_model_that_a_killed_launch_left_unregistered_is_taken_up(
             log.model(tmp_path / "policy.pt")
     log.model(tmp_path / "policy.pt")
     (version,) = tracker.client.search_model_versions()
-    assert [output.model_id for output in tracker.client.get_run(log.ref).outputs.model_outputs] == [version.model_id]
+    outputs = tracker.client.get_run(log.ref).outputs.model_outputs
+    assert [f"/{output.model_id}/" in version.source for output in outputs] == [True]
 
 
 def test_a_policy_that_cannot_be_read_is_a_fault_of_the_store(home: Path, tmp_path: Path) -> None:
