@@ -10,7 +10,7 @@ import sys
 
 import typer
 
-from pipelines.commands import doctor, evaluate, science, search, study, ui, yardsticks
+from pipelines.commands import doctor, evaluate, render, science, search, study, ui, yardsticks
 from pipelines.commands.common import BAD, DONE, INTERRUPTED
 from pipelines.errors import InputError
 
@@ -30,6 +30,7 @@ app.add_typer(study.app, name="study")
 app.add_typer(search.app, name="search")
 app.add_typer(yardsticks.app, name="yardsticks")
 app.command("evaluate", rich_help_panel=RESULTS)(evaluate.evaluate)
+app.command("render", rich_help_panel=RESULTS)(render.render)
 app.command("export", rich_help_panel=RESULTS)(study.export)
 app.command("report", rich_help_panel=RESULTS)(science.report)
 app.command("ui", rich_help_panel=RESULTS)(ui.ui)

@@ -11,13 +11,16 @@ import urllib.error
 import urllib.parse
 import urllib.request
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from filelock import FileLock
 
+from pipelines import names, views
+from pipelines.errors import InputError
 from pipelines.store import Home, StoreError, one_line, replace_durably, sync
 from pipelines.tracker import Card, Recorded, Row, Status, StudyCard, unseen
 from rhmc.types import Metrics
@@ -27,7 +30,7 @@ os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "4")  # 28 s: a server that was killed is back by then
 
 from mlflow import MlflowClient
-from mlflow.entities import Metric, Param, Run, RunTag, ViewType
+from mlflow.entities import Experiment, Metric, Param, Run, RunTag, ViewType
 from mlflow.exceptions import MlflowException
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -41,6 +44,7 @@ FROM_MLFLOW: dict[str, Status] = {theirs: ours for ours, theirs in STATUS.items(
 BATCH = 1000  # values that one request may carry
 PARENT = "study"  # tag `role` of the parent run; its runs have `run`
 PATIENCE = 20.0  # seconds that a reader waits for a writer of SQLite, as MLflow's own do
+NOTE = "mlflow.note.content"  # the tag that MLflow shows as a description
 
 
 def tracking_uri(home: Home) -> str:
@@ -102,10 +106,15 @@ class MlflowTracker:
     def _parent(self) -> str:
         ref = self._only("tags.role = 'study'", self.study.study, {"role": PARENT}).info.run_id
         assert self.experiment is not None
-        self.client.set_experiment_tag(self.experiment, "mlflow.note.content", self.study.note)
-        self.client.set_tag(ref, "mlflow.note.content", self.study.note)
+        self._describe(ref, self.study.note)
+        save_views(self.client, self.client.get_experiment(self.experiment), self.study.params)
         self.client.update_run(ref, "RUNNING")
         return ref
+
+    def _describe(self, ref: str, note: str) -> None:
+        assert self.experiment is not None
+        self.client.set_experiment_tag(self.experiment, NOTE, note)
+        self.client.set_tag(ref, NOTE, note)
 
     def _only(self, query: str, name: str, tags: dict[str, str], variant: str | None = None) -> Run:
         """The one run that matches, made if there is none.
@@ -176,7 +185,7 @@ class MlflowTracker:
             if new:  # a new run, or one whose driver was killed between making it and this
                 self.client.log_batch(ref, params=new)
             seen = {(row.metric, row.step) for row in self.rows([ref])} if run.data.metrics else set()
-        return MlflowRun(self.client, self.uri, ref, seen)
+        return MlflowRun(self, card, ref, seen)
 
     def _tags(self, card: Card) -> dict[str, str]:
         return {
@@ -203,7 +212,7 @@ class MlflowTracker:
                 first: dict[int, float] = {}
                 for value in self.client.get_metric_history(ref, metric):
                     first.setdefault(value.step, value.value)
-                yield from (Row(ref, step, metric, value) for step, value in first.items())
+                yield from (Row(ref, step, names.full(metric), value) for step, value in first.items())
 
     def _rows_sqlite(self, refs: Sequence[str]) -> Iterator[Row]:
         """The client's answer, read from MLflow's table `metrics` at once."""
@@ -212,14 +221,18 @@ class MlflowTracker:
         with closing(connect(sqlite_file(self.uri))) as database:
             for ref in refs:
                 for run, step, metric, value, is_nan in database.execute(query, (ref,)).fetchall():  # let writers in
-                    first.setdefault((run, step, metric), float("nan") if is_nan else value)
+                    first.setdefault((run, step, names.full(metric)), float("nan") if is_nan else value)
         return (Row(*place, value) for place, value in first.items())
 
-    def keep(self, path: Path) -> None:
+    def publish(self, note: str, files: Mapping[str, bytes]) -> None:
         """See `Tracker`."""
         assert self.parent is not None
-        with explained(self.uri):
-            self.client.log_artifact(self.parent, str(path))
+        with explained(self.uri), TemporaryDirectory() as folder:
+            self._describe(self.parent, note)
+            for name, content in files.items():
+                (Path(folder) / name).write_bytes(content)
+            if files:
+                self.client.log_artifacts(self.parent, folder)
 
     def close(self, status: Status) -> None:
         """See `Tracker`."""
@@ -248,13 +261,14 @@ class MlflowTracker:
 class MlflowRun:
     """See `RunLog`."""
 
-    def __init__(self, client: MlflowClient, uri: str, ref: str, seen: set[tuple[str, int]]) -> None:
-        self.client, self.uri, self.ref, self.seen = client, uri, ref, seen
+    def __init__(self, tracker: MlflowTracker, card: Card, ref: str, seen: set[tuple[str, int]]) -> None:
+        self.tracker, self.card, self.ref, self.seen = tracker, card, ref, seen
+        self.client, self.uri = tracker.client, tracker.uri
 
     def log(self, points: Sequence[Metrics]) -> None:
         """See `RunLog`."""
         now = int(time.time() * 1000)
-        values = [Metric(metric, value, now, step) for metric, step, value in unseen(points, self.seen)]
+        values = [Metric(names.shown(metric), value, now, step) for metric, step, value in unseen(points, self.seen)]
         with explained(self.uri):
             for start in range(0, len(values), BATCH):
                 self.client.log_batch(self.ref, metrics=values[start : start + BATCH])
@@ -273,6 +287,18 @@ class MlflowRun:
         """See `RunLog`."""
         with explained(self.uri):
             self.client.log_batch(self.ref, tags=[RunTag(name, value[:5000])])
+
+    def model(self, policy: Path) -> None:
+        """See `RunLog`."""
+        from pipelines.registry import register  # 1 s, and only when a run ends
+
+        tracker = self.tracker
+        assert tracker.experiment is not None
+        try:
+            with explained(self.uri):
+                register(self.client, self.ref, tracker.experiment, tracker.study, self.card, policy)
+        except InputError as error:  # a policy that cannot be read
+            raise StoreError(str(error)) from error
 
     def finish(self, status: Status) -> None:
         """See `RunLog`."""
@@ -293,17 +319,67 @@ class MlflowRun:
                 sync(path)
 
 
-def charts(uri: str, server: str) -> list[tuple[str, str]]:
-    """Each experiment with the address of its learning curves in the web interface, best final return first."""
-    view = (
-        "workflowType=machine_learning&compareRunsMode=CHART&orderByKey=metrics.%60final%2Freturn%60&orderByAsc=false"
-    )
+def addresses(uri: str, server: str) -> list[tuple[str, str, str]]:
+    """The saved views of every study in the web interface: experiment, view and address.
+
+    A study that was logged before there were views gets them here.
+    """
     quieten()
     if uri.startswith("sqlite:") and sqlite_file(uri).stat().st_size == 0:
         return []  # nothing yet, and asking would make the tables
+    found = []
     with explained(uri):
-        found = MlflowClient(uri, uri).search_experiments(max_results=1000, order_by=["name ASC"])
-    return [(e.name, f"{server}/#/experiments/{e.experiment_id}/runs?{view}") for e in found if e.name != "Default"]
+        client = MlflowClient(uri, uri)
+        for experiment in client.search_experiments(max_results=1000, order_by=["name ASC"]):
+            if NOTE in experiment.tags:
+                found += [(experiment, view) for view in _views_of(client, experiment)]
+    return [(e.name, view.name, f"{server}/#/experiments/{e.experiment_id}/runs?{view.query}") for e, view in found]
+
+
+def _views_of(client: MlflowClient, experiment: Experiment) -> list[views.View]:
+    there = views.views([])
+    if all(view.tag in experiment.tags for view in there):
+        return there
+    runs = client.search_runs([experiment.experiment_id], "tags.role = 'run'", max_results=100)
+    return save_views(client, experiment, list(dict.fromkeys(name for run in runs for name in run.data.params)))
+
+
+def save_views(client: MlflowClient, experiment: Experiment, params: Sequence[str]) -> list[views.View]:
+    """Write the saved views of an experiment whose runs differ in `params`, where they are not as they should be."""
+    wanted = views.views(params)
+    for view in wanted:
+        written = view.written(experiment.creation_time or 0)
+        if experiment.tags.get(view.tag) != written:
+            client.set_experiment_tag(experiment.experiment_id, view.tag, written)
+    return wanted
+
+
+def fetch(ref: str, wanted: Sequence[str], home: Home, folder: Path) -> list[str]:
+    """Write those of the wanted files that a run keeps to a folder.
+
+    Args:
+        ref: MLflow's id of the run, of whatever study.
+        wanted: names of files.
+        home: the work folder.
+        folder: where to write them.
+
+    Returns:
+        The names of those that are there.
+
+    Raises:
+        StoreError: no store, no such run, or the store cannot be read.
+    """
+    uri = tracking_uri(home)
+    if uri.startswith("sqlite:") and not sqlite_file(uri).exists():
+        raise StoreError(f"{sqlite_file(uri)}: nothing is logged yet, so there is no run {ref}")
+    check(uri)
+    quieten()
+    with explained(uri):
+        client = MlflowClient(uri, uri)
+        there = [kept.path for kept in client.list_artifacts(ref) if kept.path in wanted]
+        for name in there:
+            client.download_artifacts(ref, name, str(folder))
+    return there
 
 
 class Counted(NamedTuple):
@@ -325,10 +401,10 @@ def census(home: Home) -> list[Counted] | None:
         return None  # asking would make one
     reader = MlflowTracker(StudyCard("", "", ""), home, write=False)
     with explained(uri):
-        names = {e.experiment_id: e.name for e in reader.client.search_experiments(max_results=1000)}
-        runs = reader._search("tags.role = 'run'", list(names))
+        titles = {e.experiment_id: e.name for e in reader.client.search_experiments(max_results=1000)}
+        runs = reader._search("tags.role = 'run'", list(titles))
     return [
-        Counted(names[run.info.experiment_id], _recorded(run).status, run.data.tags.get("fingerprint", ""))
+        Counted(titles[run.info.experiment_id], _recorded(run).status, run.data.tags.get("fingerprint", ""))
         for run in runs
     ]
 

@@ -9,8 +9,10 @@ from typing import Any, NamedTuple
 
 from ruamel.yaml import YAML
 
-from pipelines.study import RunSpec, Study
+from pipelines.study import RunSpec, Study, changes
 from pipelines.tracker import Card, Recorded, StudyCard
+
+KIND = "algo.kind"  # which is what the param `method` says
 
 
 class Item(NamedTuple):
@@ -38,8 +40,9 @@ def items(study: Study, fingerprint: str, commit: str) -> list[Item]:
     planned = []
     for run in runs:
         spec, flat = run.spec, flatten(run.spec.model_dump(mode="json"))
-        params = {name: str(flat[name]) for name in varying if name in flat} | {"seed": str(spec.seed)}
         algorithm, task = spec.algo.kind, spec.env.kind
+        params = {"method": algorithm} | {name: str(flat[name]) for name in varying if name in flat and name != KIND}
+        params |= {"seed": str(spec.seed)}
         card = Card(run.arm, spec.seed, spec.id, fingerprint, algorithm, task, commit, params)
         planned.append(Item(card, spec, study.name))
     return planned
@@ -65,17 +68,24 @@ def what_varies(specs: Iterable[RunSpec]) -> list[str]:
 
 def study_card(study: Study) -> StudyCard:
     """The study as its experiment shows it."""
-    arms = list(dict.fromkeys(run.arm for run in study.runs()))
-    seeds = sorted({run.spec.seed for run in study.runs()})
-    steps = sorted({run.spec.trainer.steps for run in study.runs()})
+    runs = study.runs()
+    arms = list(dict.fromkeys(run.arm for run in runs))
+    seeds = sorted({run.spec.seed for run in runs})
+    steps = sorted({run.spec.trainer.steps for run in runs})
+    params = [name for name in what_varies([run.spec for run in runs]) if name not in (KIND, "seed")]
     budget = ", ".join(f"{count:,}" for count in steps)
     note = (
         f"{study.question}\n\n"
         f"Profile `{study.profile}`: {len(arms)} arms × {len(seeds)} seeds, {budget} environment steps each.\n\n"
-        + "\n".join(f"- {arm}" for arm in arms)
-        + "\n\nGroup the runs by the tag `variant` to compare arms."
+        + "\n".join(f"- **{arm}**: {_differs(study, arm)}" for arm in arms)
     )
-    return StudyCard(study.name, study.profile, note)
+    return StudyCard(study.name, study.profile, note, ("method", *params, "seed"))
+
+
+def _differs(study: Study, arm: str) -> str:
+    """What an arm changes in the base, as code."""
+    found = changes(study.base, study.arms[arm])
+    return ", ".join(f"`{name}={value}`" for name, value in found.items()) or "the base"
 
 
 def finished(recorded: Iterable[Recorded]) -> set[tuple[str, str]]:

@@ -5,11 +5,16 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from pipelines.overview import Overview
 from pipelines.plan import Item, finished, resolved_yaml
+from pipelines.policy import CONFIG, FILE
 from pipelines.progress import Board
+from pipelines.render import EPISODE, WHY_NOT
 from pipelines.store import Checkpoints, Home
 from pipelines.tracker import RunLog, Status, StudyCard, Tracker, points_of
 from rhmc.trainer import grid_step
+
+EXTRAS = (EPISODE, WHY_NOT)  # what a training may leave beside its policy
 
 
 class Recorder:
@@ -28,6 +33,7 @@ class Recorder:
     def __init__(self, study: StudyCard, plan: list[Item], tracker: Tracker, home: Home, board: Board) -> None:
         self.study, self.plan, self.tracker, self.home, self.board = study, plan, tracker, home, board
         self.logs: dict[str, RunLog] = {}
+        self.arms: dict[str, str] = {}  # of the runs that were started, by key
         self.failures: dict[str, str] = {}  # name of the run -> one line
         self.waiting: dict[str, list[Item]] = defaultdict(list)
         self.busy = False  # whether another process was training one of them
@@ -36,6 +42,8 @@ class Recorder:
             if (item.card.arm, item.key) not in done:
                 self.waiting[item.key].append(item)
         self.skipped = len(plan) - self.left
+        self.overview = Overview(study, plan, tracker)
+        self.overview.describe()
         self._tidy()
 
     def _tidy(self) -> None:
@@ -72,12 +80,17 @@ class Recorder:
         for item in items:
             log = self.tracker.start(item.card)
             log.log(points)
-            log.text("config.yaml", resolved_yaml(item, self.study))
+            log.text(CONFIG, resolved_yaml(item, self.study))
             with TemporaryDirectory() as folder:
-                if policy := self.tracker.file(source, "policy.pt", Path(folder)):
-                    log.artifact(policy)
+                for name in EXTRAS:
+                    self.tracker.file(source, name, Path(folder))
+                (Path(folder) / CONFIG).write_text(resolved_yaml(item, self.study))  # for a policy without its spec
+                if self.tracker.file(source, FILE, Path(folder)):
+                    keep(log, Path(folder))
             log.tag("reused_from", source)
             log.finish("finished")
+            self.overview.points(item.card.arm, item.key, points)
+            self.overview.ended(item.card.arm, item.key, "finished")
             self.board.say(f"{item.name}: the same training was finished before; copied")
 
     def todo(self) -> list[Item]:
@@ -87,8 +100,9 @@ class Recorder:
     def start(self, key: str) -> None:
         """A training begins or continues."""
         item = self.waiting[key][0]
+        self.arms[key] = item.card.arm
         self.logs[key] = self.tracker.start(item.card)
-        self.logs[key].text("config.yaml", resolved_yaml(item, self.study))
+        self.logs[key].text(CONFIG, resolved_yaml(item, self.study))
         self.board.start(item.name, item.spec.trainer.steps, self._reached(item))
 
     def _reached(self, item: Item) -> int:
@@ -104,6 +118,7 @@ class Recorder:
         item, points = self.waiting[key][0], result["points"]
         self.logs[key].log(points)
         self.board.points(item.name, points)
+        self.overview.points(item.card.arm, key, points)
         if result["stopped"]:
             self._end(key, "interrupted")
             if result.get("busy"):
@@ -116,7 +131,7 @@ class Recorder:
 
     def _finish(self, key: str) -> None:
         log, items, folder = self.logs[key], self.waiting.pop(key), self.home.checkpoints(key)
-        log.artifact(folder / "policy.pt")
+        keep(log, folder)
         self._end(key, "finished")
         self.board.end(items[0].name, "finished")
         self._copy(log.ref, items[1:])
@@ -140,3 +155,13 @@ class Recorder:
 
     def _end(self, key: str, status: Status) -> None:
         self.logs.pop(key).finish(status)
+        self.overview.ended(self.arms[key], key, status)
+
+
+def keep(log: RunLog, folder: Path) -> None:
+    """Keep what a finished training left in a folder, and offer its policy as a model."""
+    log.artifact(folder / FILE)
+    for name in EXTRAS:
+        if (folder / name).exists():
+            log.artifact(folder / name)
+    log.model(folder / FILE)

@@ -131,6 +131,7 @@ def _launch(study: Study, home: Home, interrupts: Interrupts) -> int:
             while left and not interrupts.came:
                 train(study, recorder, home, interrupts)
                 left = recorder.again()
+            recorder.overview.publish()
         status = "failed" if recorder.failures else "interrupted" if recorder.left else "finished"
     finally:
         tracker.close(status)
@@ -155,6 +156,7 @@ def train(study: Study, recorder: Recorder, home: Home, interrupts: Interrupts) 
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)
     stop = scratch / "stop"
+    drawn = animated(study, recorder.plan)
     jobs = [
         {
             "key": item.key,
@@ -162,6 +164,7 @@ def train(study: Study, recorder: Recorder, home: Home, interrupts: Interrupts) 
             "folder": str(home.checkpoints(item.key)),
             "checkpoint_every": study.resources.checkpoint_every,
             "stop": str(stop),
+            "animate": item.key in drawn,
         }
         for item in recorder.todo()
     ]
@@ -176,6 +179,14 @@ def train(study: Study, recorder: Recorder, home: Home, interrupts: Interrupts) 
 def set_up_ray() -> None:
     """Ray reads its settings when it is imported."""
     os.environ.update({name: os.environ.get(name, value) for name, value in RAY_SETTINGS.items()})
+
+
+def animated(study: Study, plan: list[Item]) -> set[str]:
+    """Keys of the trainings that leave an animation: by default the first seed of every arm."""
+    first: dict[str, str] = {}
+    for item in plan:
+        first.setdefault(item.card.arm, item.key)
+    return {"none": set[str](), "first": set(first.values()), "all": {i.key for i in plan}}[study.resources.animate]
 
 
 # What a person reads

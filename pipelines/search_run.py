@@ -318,7 +318,7 @@ def trial_card(search: Search, asked: Asked, code: str, commit: str) -> Card:
     parts = (asked.setting.canonical(), str(search.seed_list()), str(asked.place), search.identity(asked.arm, code))
     spec_id = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:12]
     kinds = asked.setting.algo.kind, asked.setting.env.kind
-    params = {f"algo.{name}": str(value) for name, value in asked.params.items()}
+    params = {"method": kinds[0]} | {f"algo.{name}": str(value) for name, value in asked.params.items()}
     return Card(asked.arm, search.seed_list()[0], spec_id, code, *kinds, commit, params, asked.place)
 
 
@@ -336,7 +336,8 @@ def search_card(search: Search) -> StudyCard:
         f"pruner {search.pruner.kind}.\n\n" + "\n".join(spaces) + "\n\nA run is a trial: its curve is the mean over "
         "its seeds, `objective` the mean of their final returns. Pruned trials have no `objective`."
     )
-    return StudyCard(search.name, search.profile, note)
+    params = {f"algo.{name}": None for arm in search.arms.values() for name in arm.space}
+    return StudyCard(search.name, search.profile, note, ("method", *params))
 
 
 # Results
@@ -364,8 +365,8 @@ def results(
             file = out / file_name(search, ledger.arm)
             write_text(file, winner_yaml(search, ledger.arm, best, ledger.counts(), code))
             written.winners.append(file)
-    for file in (*written.plots, *written.winners):
-        tracker.keep(file)
+    files = (*written.plots, *written.winners)
+    tracker.publish(search_card(search).note, {file.name: file.read_bytes() for file in files})
     return written
 
 

@@ -12,7 +12,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from functools import reduce
 from pathlib import Path
-from typing import Annotated, Any, Generic, NamedTuple, Self, TypeVar
+from typing import Annotated, Any, Generic, Literal, NamedTuple, Self, TypeVar
 
 from pydantic import BaseModel, Field, field_validator
 
@@ -94,6 +94,7 @@ class Resources(Frozen):
     concurrent: int = Field(2, ge=1, description="runs at a time")
     cpus: int = Field(1, ge=1, description="processors of a run")
     checkpoint_every: int = Field(10, ge=1, description="points of the evaluation grid between checkpoints")
+    animate: Literal["first", "all", "none"] = Field("first", description="seeds whose runs keep an animated episode")
 
 
 class Study(Frozen):

@@ -4,7 +4,7 @@ A run in a log is named by study, profile, arm and key (spec id and code fingerp
 already continues it. A point that is logged already is not logged again.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
@@ -21,6 +21,7 @@ class StudyCard(NamedTuple):
     study: str
     profile: str
     note: str  # Markdown: question, arms, seeds, budget
+    params: tuple[str, ...] = ()  # names of what varies between its runs, and method and seed
 
 
 class Card(NamedTuple):
@@ -33,7 +34,7 @@ class Card(NamedTuple):
     algorithm: str
     task: str
     commit: str
-    params: dict[str, str]  # what varies between the runs of the study, and the seed
+    params: dict[str, str]  # what varies between the runs of the study, and method and seed
     trial: int | None = None  # of a search: then the run stands for all of its seeds
 
     @property
@@ -88,6 +89,10 @@ class RunLog(Protocol):
         """Set or replace a tag."""
         ...
 
+    def model(self, policy: Path) -> None:
+        """Offer the policy in a file as a model that can be loaded by name; once, however often it is called."""
+        ...
+
     def finish(self, status: Status) -> None:
         """Close the run. It can be started again."""
         ...
@@ -116,8 +121,8 @@ class Tracker(Protocol):
         """Write a file that a run keeps to a folder; None if it keeps none of that name."""
         ...
 
-    def keep(self, path: Path) -> None:
-        """Keep a copy of a file with the study itself, in place of one of that name."""
+    def publish(self, note: str, files: Mapping[str, bytes]) -> None:
+        """Replace the study's description (Markdown) and its files of these names."""
         ...
 
     def close(self, status: Status) -> None:
@@ -157,6 +162,7 @@ class MemoryRun:
     seen: set[tuple[str, int]] = field(default_factory=set)
     tags: dict[str, str] = field(default_factory=dict)
     files: dict[str, bytes] = field(default_factory=dict)
+    models: list[bytes] = field(default_factory=list)
 
     def log(self, points: Sequence[Metrics]) -> None:
         """See `RunLog`."""
@@ -174,6 +180,10 @@ class MemoryRun:
         """See `RunLog`."""
         self.tags[name] = value
 
+    def model(self, policy: Path) -> None:
+        """See `RunLog`."""
+        self.models = self.models or [policy.read_bytes()]
+
     def finish(self, status: Status) -> None:
         """See `RunLog`."""
         self.status = status
@@ -185,7 +195,7 @@ class MemoryTracker:
     def __init__(self, study: StudyCard, shelf: list[MemoryRun]) -> None:
         self.study, self.shelf = study, shelf
         self.names = count(len(shelf))
-        self.kept: dict[str, bytes] = {}
+        self.note, self.files = study.note, dict[str, bytes]()
         self._interrupt_running()
 
     def _mine(self) -> list[MemoryRun]:
@@ -227,9 +237,9 @@ class MemoryTracker:
         (folder / name).write_bytes(run.files[name])
         return folder / name
 
-    def keep(self, path: Path) -> None:
+    def publish(self, note: str, files: Mapping[str, bytes]) -> None:
         """See `Tracker`."""
-        self.kept[path.name] = path.read_bytes()
+        self.note, self.files = note, self.files | dict(files)
 
     def close(self, status: Status) -> None:
         """See `Tracker`."""

@@ -8,17 +8,19 @@ import time
 import traceback
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any, NotRequired, TypedDict
 
 from filelock import Timeout
 from ray.tune import Trainable
 
+from pipelines.policy import FILE, SPEC, Saved
 from pipelines.seeds import Seeds
 from pipelines.store import Checkpoints, StoreError, one_line, save_atomically, without_replay
 from pipelines.study import RunSpec
 from rhmc.trainer import Trainer
 from rhmc.types import Metrics, State
 
+FRAMES = 30  # of an animation that a run keeps
 PATIENCE = 60.0  # seconds to wait for the worker of a killed driver to let go of a run
 
 
@@ -30,6 +32,7 @@ class Job(TypedDict):
     folder: str  # of the run's checkpoints
     checkpoint_every: int  # points of the grid
     stop: str  # a file: once it exists, the run saves itself at the next point and ends
+    animate: NotRequired[bool]  # leave an animation of an episode beside the policy
 
 
 class RunTrainable(Trainable):
@@ -109,10 +112,23 @@ class RunTrainable(Trainable):
     def _save(self, trainer: Trainer | Seeds) -> None:
         state = self.state()
         if trainer.done:  # also where nothing is left to train: the file that a killed worker left may be damaged
-            save_atomically(self.checkpoints.folder / "policy.pt", without_replay(state["trainer"]))
+            kept = without_replay(state["trainer"]) | {SPEC: self.job["spec"]}
+            save_atomically(self.checkpoints.folder / FILE, kept)
+            if self.job.get("animate"):
+                self._animate(kept)
         if len(self.history) > self.saved:
-            self.checkpoints.save(len(self.history), state)
+            self.checkpoints.save(len(self.history), state | {SPEC: self.job["spec"]})
         self.saved = len(self.history)
+
+    def _animate(self, kept: State) -> None:
+        """Draw an episode. Training is over and a copy of the policy acts; what goes wrong here is only noted."""
+        from pipelines.render import EPISODE, WHY_NOT, episode_gif, write
+
+        try:
+            spec = RunSpec.model_validate_json(self.job["spec"])
+            write(self.checkpoints.folder / EPISODE, episode_gif(Saved(spec, kept["algorithm"]), frames=FRAMES))
+        except Exception as error:
+            (self.checkpoints.folder / WHY_NOT).write_text(f"{type(error).__name__}: {one_line(error)}\n")
 
     def state(self) -> State:
         """All of the run between two points: the trainer, and the metrics so far for a log that missed some."""

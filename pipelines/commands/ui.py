@@ -29,16 +29,16 @@ def ui(port: Annotated[int, typer.Option(min=1, max=65535, help="Where to listen
     home = Home(work_folder())
     if not uri and not home.database.exists():
         raise InputError(f"{home.database}: nothing is logged yet; `rhmc study run FILE` does it")
-    from pipelines.mlflow_tracker import charts
+    from pipelines.mlflow_tracker import addresses
     from pipelines.mlflow_tracker import check as check_store
 
     try:
         check_store(uri or f"sqlite:///{home.database}")
-        curves = charts(uri or f"sqlite:///{home.database}", f"http://{HOST}:{port}")
+        saved = addresses(uri or f"sqlite:///{home.database}", f"http://{HOST}:{port}")
     except StoreError as error:
         raise InputError(str(error)) from error
     _free(port)
-    _serve(uri or f"sqlite:///{home.database}", home.artifacts, port, curves)
+    _serve(uri or f"sqlite:///{home.database}", home.artifacts, port, saved)
 
 
 def _free(port: int) -> None:
@@ -52,13 +52,13 @@ def _free(port: int) -> None:
             raise InputError(f"--port: {port} cannot be used ({error.strerror}); choose another") from error
 
 
-def _serve(uri: str, artifacts: Path, port: int, curves: Iterable[tuple[str, str]]) -> None:
+def _serve(uri: str, artifacts: Path, port: int, saved: Iterable[tuple[str, str, str]]) -> None:
     command = [sys.executable, "-m", "mlflow", "server", "--backend-store-uri", uri]
     command += ["--host", HOST, "--port", str(port), "--workers", "1", "--artifacts-destination", str(artifacts)]
     quiet = {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false", "MLFLOW_DISABLE_TELEMETRY": "true", "DO_NOT_TRACK": "true"}
     say(f"http://{HOST}:{port}/#/experiments?workflowType=machine_learning  (Ctrl-C ends it)")
-    for name, address in curves:
-        say(f"  curves of {name}, to be grouped by the tag `variant`: {address}")
+    for experiment, view, address in saved:
+        say(f"  {experiment}, {view}: {address}")
 
     def leave(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt

@@ -26,7 +26,7 @@ from pipelines.plan import Item, study_card, what_varies
 from pipelines.progress import LiveBoard, PlainBoard, duration
 from pipelines.ray_driver import _knock, sockets
 from pipelines.recorder import Recorder
-from pipelines.run import Interrupts, _arguments, run_study, show_status
+from pipelines.run import Interrupts, _arguments, animated, run_study, show_status
 from pipelines.store import Checkpoints, Home, StoreError
 from pipelines.study import Study
 from pipelines.tracker import MemoryRun, MemoryTracker, StudyCard, points_of
@@ -61,7 +61,7 @@ def launch(shelf: list[MemoryRun], tmp_path: Path) -> Launch:
 def finish(recorder: Recorder, key: str) -> None:
     """What a worker does at its end."""
     folder = recorder.home.checkpoints(key)
-    folder.mkdir(parents=True)
+    folder.mkdir(parents=True, exist_ok=True)
     (folder / "policy.pt").write_bytes(b"weights")
     recorder.result(key, {"done": True, "stopped": False, "points": POINTS[1:]})
 
@@ -209,6 +209,8 @@ def test_what_another_study_finished_is_copied(launch: Launch, shelf: list[Memor
     other = launch(study=STUDY._replace(study="other"))
     key = other.todo()[0].key
     step(other, key)
+    other.home.checkpoints(key).mkdir(parents=True)
+    (other.home.checkpoints(key) / "episode.gif").write_bytes(b"GIF89a")
     finish(other, key)
     recorder = launch()
     recorder.reuse()
@@ -216,6 +218,8 @@ def test_what_another_study_finished_is_copied(launch: Launch, shelf: list[Memor
     assert [(run.study.study, run.status) for run in shelf] == [("other", "finished"), ("tiny", "finished")]
     assert points_of(shelf[1].values) == POINTS
     assert shelf[1].files["policy.pt"] == shelf[0].files["policy.pt"] == b"weights"
+    assert shelf[1].models == shelf[0].models == [b"weights"]
+    assert shelf[1].files["episode.gif"] == b"GIF89a"
 
 
 def test_other_code_is_another_run(launch: Launch) -> None:
@@ -228,10 +232,10 @@ def test_other_code_is_another_run(launch: Launch) -> None:
     assert launch(stale).left == 2
 
 
-def test_params_are_what_varies_and_the_seed() -> None:
+def test_params_are_what_varies_and_method_and_seed() -> None:
     assert [item.card.params for item in plan()] == [
-        {"algo.lr": "0.0001", "seed": "0"},
-        {"algo.lr": "0.01", "seed": "0"},
+        {"method": "iql", "algo.lr": "0.0001", "seed": "0"},
+        {"method": "iql", "algo.lr": "0.01", "seed": "0"},
     ]
     kinds = plan(tiny(arms={"a": setting(), "b": setting(encoder="pairwise")}))
     assert kinds[1].card.params["algo.encoder"] == "pairwise"
@@ -241,7 +245,27 @@ def test_the_experiment_says_what_it_is_about() -> None:
     note = study_card(tiny()).note
     assert "Does the whole chain hold?" in note
     assert "Profile `quick`: 2 arms × 1 seeds, 600 environment steps each." in note
-    assert "- slow\n- fast" in note
+    assert "- **slow**: the base\n- **fast**: `algo.lr=0.01`" in note
+    assert study_card(tiny()).params == ("method", "algo.lr", "seed")
+
+
+def test_the_method_is_named_once() -> None:
+    study = Study.load(STUDIES / "coverage.yaml")
+    params = study_card(study).params
+    assert params[0] == "method"
+    assert "algo.kind" not in params
+    cards = [item.card for item in plan(study)]
+    assert {name for card in cards for name in card.params} == set(params)
+    assert {card.params["method"] for card in cards} >= {"rhmc", "qmix", "mappo"}
+
+
+def test_the_first_seed_of_an_arm_leaves_an_animation() -> None:
+    study = tiny().model_copy(update={"seeds": 2})
+    runs = plan(study)
+    assert animated(study, runs) == {item.key for item in runs if item.card.seed == 0}
+    for which, keys in {"all": {item.key for item in runs}, "none": set()}.items():
+        changed = study.model_copy(update={"resources": study.resources.model_copy(update={"animate": which})})
+        assert animated(changed, runs) == keys
 
 
 # What a person sees
@@ -457,7 +481,18 @@ def test_run_skip_fail_and_retry(home: Path, cluster: None, capsys: pytest.Captu
     rows = [row for row in tracker.rows([after["fast"].ref]) if not row.metric.startswith("time/")]
     assert [(row.step, row.metric, row.value) for row in rows] == sorted(expected)
     files = tracker.client.list_artifacts(after["fast"].ref)
-    assert sorted(file.path for file in files) == ["config.yaml", "policy.pt"]
+    assert sorted(file.path for file in files) == ["config.yaml", "episode.gif", "policy.pt"]
+    parent = tracker.client.search_runs([tracker.experiment], "tags.role = 'study'")[0]
+    assert sorted(file.path for file in tracker.client.list_artifacts(parent.info.run_id)) == [
+        "curves.png",
+        "finals.csv",
+    ]
+    note = parent.data.tags["mlflow.note.content"]
+    assert "2 of 2 runs are finished" in note
+    assert {version.name for version in tracker.client.search_model_versions()} == {
+        "tiny-quick-slow",
+        "tiny-quick-fast",
+    }
 
 
 def test_the_kept_policy_acts(tmp_path: Path) -> None:

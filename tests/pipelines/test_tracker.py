@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from pipelines import mlflow_tracker
-from pipelines.mlflow_tracker import MlflowTracker, charts, open_existing
+from pipelines.mlflow_tracker import MlflowTracker, open_existing
+from pipelines.names import shown
 from pipelines.store import Home, StoreError
 from pipelines.tracker import Card, MemoryRun, MemoryTracker, Row, StudyCard, Tracker, points_of
 
@@ -45,7 +46,7 @@ def point(step: int, **values: float) -> dict[str, float]:
 def logged_steps(tracker: Tracker, ref: str, metric: str) -> list[int]:
     """The steps of a metric as the log holds them, doubled ones twice."""
     if isinstance(tracker, MlflowTracker):
-        return sorted(value.step for value in tracker.client.get_metric_history(ref, metric))
+        return sorted(value.step for value in tracker.client.get_metric_history(ref, shown(metric)))
     return [row.step for row in tracker.rows([ref]) if row.metric == metric]
 
 
@@ -369,14 +370,3 @@ def test_a_database_whose_writer_was_killed_in_the_middle_of_a_write_is_used_aga
     tracker = MlflowTracker(STUDY, Home(home))
     assert len(tracker.client.get_experiment(tracker.experiment).tags) < 10
     assert not file.with_name("mlflow.db-journal").exists()
-
-
-def test_charts_are_addresses_of_the_experiments(home: Path) -> None:
-    tracker = MlflowTracker(STUDY, Home(home))
-    ((name, address),) = charts(tracker.uri, "http://127.0.0.1:5000")
-    assert name == "demo (quick)"
-    assert address.startswith(f"http://127.0.0.1:5000/#/experiments/{tracker.experiment}/runs?workflowType=")
-    empty = home / "empty.db"
-    empty.touch()
-    assert charts(f"sqlite:///{empty}", "") == []
-    assert empty.stat().st_size == 0

@@ -1,0 +1,190 @@
+"""What the parent run of a study shows: its question and arms, the results so far, their curves and table.
+
+Means and ranges over seeds only, to look at while a study runs. Intervals and verdicts are the report's.
+"""
+
+import csv
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from io import BytesIO, StringIO
+from typing import NamedTuple
+
+from pipelines.plan import Item
+from pipelines.tracker import Row, Status, StudyCard, Tracker
+from rhmc.types import Metrics
+
+PAUSE = 30.0  # seconds between two refreshes while a study runs
+CURVE, FINAL = "eval/return", "final/return"
+FINALS = {
+    FINAL: "return",
+    "final/coverage": "coverage",
+    "final/landmarks_covered": "landmarks covered",
+    "final/collisions": "collisions",
+}
+FIGURE, TABLE = "curves.png", "finals.csv"  # artifacts of the parent run
+MOST = 12  # arms in the figure; more are not told apart
+Point = tuple[int, float]  # step, value
+
+
+class Run(NamedTuple):
+    """What is shown of one run."""
+
+    arm: str
+    seed: int
+    status: Status | None  # None: not begun
+    curve: Sequence[Point]
+    finals: Mapping[str, float]
+
+
+class Overview:
+    """Keeps the parent run's description and files up to date.
+
+    Args:
+        study: whose.
+        plan: its runs.
+        tracker: its log, asked once for what earlier launches left there.
+    """
+
+    def __init__(self, study: StudyCard, plan: Sequence[Item], tracker: Tracker) -> None:
+        self.study, self.tracker = study, tracker
+        self.runs = {(item.card.arm, item.key): Run(item.card.arm, item.card.seed, None, (), {}) for item in plan}
+        there = {run.ref: run for run in tracker.recorded() if (run.arm, run.key) in self.runs}
+        rows: dict[str, list[Row]] = {ref: [] for ref in there}
+        for row in tracker.rows(list(there)) if there else []:
+            if row.metric == CURVE or row.metric in FINALS:
+                rows[row.ref].append(row)
+        for ref, run in there.items():
+            self._take(run.arm, run.key, run.status, [(row.step, {row.metric: row.value}) for row in rows[ref]])
+        self.shown = float("-inf")
+
+    def points(self, arm: str, key: str, points: Iterable[Metrics]) -> None:
+        """New points of a run that is under way."""
+        self._take(arm, key, "running", [(int(point["step"]), point) for point in points])
+
+    def ended(self, arm: str, key: str, status: Status) -> None:
+        """A run ended; what the log shows is refreshed now and then."""
+        self._take(arm, key, status, [])
+        if time.monotonic() - self.shown >= PAUSE:
+            self.publish()
+
+    def _take(self, arm: str, key: str, status: Status, points: Iterable[tuple[int, Mapping[str, float]]]) -> None:
+        run = self.runs[arm, key]
+        curve, finals = dict(run.curve), dict(run.finals)
+        for step, values in points:
+            if CURVE in values:
+                curve.setdefault(step, values[CURVE])
+            finals |= {name: values[name] for name in FINALS if name in values}
+        self.runs[arm, key] = run._replace(status=status, curve=sorted(curve.items()), finals=finals)
+
+    def describe(self) -> None:
+        """Refresh the description alone."""
+        self.tracker.publish(f"{self.study.note}\n\n{so_far(list(self.runs.values()))}", {})
+
+    def publish(self) -> None:
+        """Refresh the description, the figure and the table."""
+        self.shown = time.monotonic()
+        runs = list(self.runs.values())
+        files = {TABLE: table(runs).encode()}
+        if any(run.curve for run in runs):
+            files[FIGURE] = figure(self.study, runs)
+        self.tracker.publish(f"{self.study.note}\n\n{so_far(runs)}", files)
+
+
+def by_arm(runs: Iterable[Run]) -> dict[str, list[Run]]:
+    """The runs of each arm, in the order given."""
+    arms: dict[str, list[Run]] = {}
+    for run in runs:
+        arms.setdefault(run.arm, []).append(run)
+    return arms
+
+
+def so_far(runs: Sequence[Run]) -> str:
+    """Markdown: which seeds are finished, the mean of each final metric over them, and who is ahead."""
+    shown = {key: name for key, name in FINALS.items() if any(key in run.finals for run in runs)}
+    heads = ["arm", "finished seeds", "others", *(f"final {name}" for name in shown.values())]
+    lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
+    for arm, mine in by_arm(runs).items():
+        done = [run for run in mine if run.status == "finished"]
+        seeds = ", ".join(str(run.seed) for run in done) or "none"
+        means = [_mean_and_range([run.finals[key] for run in done if key in run.finals]) for key in shown]
+        lines.append(f"| {' | '.join([_cell(arm), seeds, _others(mine), *means])} |")
+    return "\n".join([f"### So far\n\n{_ahead(runs)}\n", *lines])
+
+
+def _ahead(runs: Sequence[Run]) -> str:
+    means = {
+        arm: sum(values) / len(values)
+        for arm, mine in by_arm(runs).items()
+        if (values := [run.finals[FINAL] for run in mine if run.status == "finished" and FINAL in run.finals])
+    }
+    finished = sum(run.status == "finished" for run in runs)
+    count = f"{finished} of {len(runs)} runs are finished"
+    if len(means) < 2:
+        return f"{count}."
+    best = max(means, key=lambda arm: means[arm])
+    return f"{count}; the highest mean final return is that of **{best}**. `rhmc report` gives intervals and verdicts."
+
+
+def _others(mine: Sequence[Run]) -> str:
+    """Seeds that are not finished, by what they are."""
+    words: dict[str, list[str]] = {}
+    for run in mine:
+        if run.status != "finished":
+            words.setdefault(run.status or "missing", []).append(str(run.seed))
+    return "; ".join(f"{status}: {', '.join(seeds)}" for status, seeds in words.items())
+
+
+def _mean_and_range(values: Sequence[float]) -> str:
+    if not values:
+        return "–"
+    mean = f"{sum(values) / len(values):.2f}"
+    return f"{mean} ({min(values):.2f} to {max(values):.2f})" if len(values) > 1 else mean
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|")
+
+
+def table(runs: Sequence[Run]) -> str:
+    """CSV: every planned run with its final values."""
+    out = StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    shown = [key for key in FINALS if any(key in run.finals for run in runs)]
+    writer.writerow(["arm", "seed", "status", *shown])
+    for run in runs:
+        writer.writerow([run.arm, run.seed, run.status or "missing", *(run.finals.get(key, "") for key in shown)])
+    return out.getvalue()
+
+
+def figure(study: StudyCard, runs: Sequence[Run]) -> bytes:
+    """PNG: the mean return of every arm over its finished seeds at each step, and their range.
+
+    An arm without a finished seed is shown by what its seeds have in common so far.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # 1 s, and only where something is finished
+    from matplotlib.figure import Figure
+
+    sheet = Figure(figsize=(8, 4.5), layout="constrained")
+    FigureCanvasAgg(sheet)
+    axes = sheet.add_subplot(xlabel="environment steps", ylabel="return of the evaluation bank")
+    curves = {arm: found for arm, mine in by_arm(runs).items() if (found := _common(mine))}
+    for arm, (seeds, steps, values) in list(curves.items())[:MOST]:
+        axes.plot(steps, [sum(at) / seeds for at in values], lw=1.5, label=f"{arm} ({seeds})")
+        axes.fill_between(steps, [min(at) for at in values], [max(at) for at in values], alpha=0.15, lw=0)
+    left = f", {MOST} of {len(curves)} arms" if len(curves) > MOST else ""
+    axes.set_title(f"{study.study} ({study.profile}): mean and range over seeds{left}", fontsize=10)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8, title="arm (seeds)", title_fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
+    out = BytesIO()
+    sheet.savefig(out, format="png", dpi=110, metadata={"Software": None})
+    return out.getvalue()
+
+
+def _common(mine: Sequence[Run]) -> tuple[int, list[int], list[list[float]]] | None:
+    """How many runs, the steps that all of them have, and their values there."""
+    begun = [run for run in mine if run.curve]
+    curves = [dict(run.curve) for run in begun if run.status == "finished"] or [dict(run.curve) for run in begun]
+    if not curves:
+        return None
+    steps = sorted(set.intersection(*map(set, curves)))
+    return len(curves), steps, [[curve[step] for curve in curves] for step in steps]

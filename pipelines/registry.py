@@ -1,0 +1,110 @@
+"""Trained policies as models in MLflow's registry: one name per study, profile and arm, one version per run."""
+
+import json
+import re
+import warnings
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import torch
+from mlflow import MlflowClient
+from mlflow.entities import LoggedModel, LoggedModelOutput
+from mlflow.exceptions import MlflowException
+from mlflow.models import Model, ModelSignature
+from mlflow.types import ColSpec, Schema, TensorSpec
+from mlflow.utils.mlflow_tags import MLFLOW_MODEL_VERSIONS
+
+from pipelines.policy import FILE, load, save, sizes
+from pipelines.study import RunSpec
+from pipelines.tracker import Card, StudyCard
+from rhmc.envs import make_env
+
+with warnings.catch_warnings():  # MLflow's own type hints make it warn
+    warnings.simplefilter("ignore")
+    from mlflow.pyfunc import save_model
+
+CODE = Path(__file__).with_name("served.py")
+REQUIREMENTS = [f"torch=={torch.__version__.partition('+')[0]}", f"numpy=={np.__version__}"]
+
+
+def model_name(study: StudyCard, arm: str) -> str:
+    """The registered name of an arm: what stands in `models:/<name>/<version>`."""
+    words = f"{study.study}-{study.profile}-{arm}"
+    return re.sub(r"[^A-Za-z0-9._+-]+", "-", words).strip("-")
+
+
+def register(client: MlflowClient, run: str, experiment: str, study: StudyCard, card: Card, policy: Path) -> None:
+    """Offer a run's policy as a model, once however often it is called.
+
+    The alias `seed-<n>` names the newest version of that seed.
+
+    Args:
+        client: of the store.
+        run: MLflow's id of the run.
+        experiment: that of its experiment.
+        study: whose run.
+        card: the run.
+        policy: its file.
+    """
+    name = model_name(study, card.arm)
+    if client.search_model_versions(f"name = '{name}' and run_id = '{run}'", max_results=1):
+        return
+    tags = {"study": study.study, "profile": study.profile, "variant": card.arm, "seed": str(card.seed)}
+    tags |= {"spec": card.spec_id, "fingerprint": card.fingerprint, "commit": card.commit}
+    model = _logged(client, run, experiment, name.replace(".", "_"), tags, policy)
+    try:
+        client.create_registered_model(name, tags={k: tags[k] for k in ("study", "profile", "variant")})
+    except MlflowException as error:
+        if error.error_code != "RESOURCE_ALREADY_EXISTS":
+            raise
+    made = client.create_model_version(name, model.artifact_location, run, tags, model_id=model.model_id)
+    client.set_registered_model_alias(name, f"seed-{card.seed}", made.version)
+    versions = [{"name": name, "version": made.version}]
+    client.set_logged_model_tags(model.model_id, {MLFLOW_MODEL_VERSIONS: json.dumps(versions)})
+
+
+def _logged(
+    client: MlflowClient, run: str, experiment: str, name: str, tags: dict[str, str], policy: Path
+) -> LoggedModel:
+    """Keep the model's files in the store, as an output of the run; the one that is there already, if so."""
+    outputs = client.get_run(run).outputs
+    if outputs and outputs.model_outputs:  # kept by a launch that was killed before it could register it
+        return client.get_logged_model(outputs.model_outputs[0].model_id)
+    saved = load(policy)
+    spec = saved.spec
+    made = client.create_logged_model(experiment, name, run, tags, model_type="policy")
+    with TemporaryDirectory() as folder:
+        local, file = str(Path(folder) / "model"), Path(folder) / FILE
+        save(file, saved)
+        save_model(
+            local,
+            python_model=str(CODE),
+            artifacts={"policy": str(file)},
+            mlflow_model=Model(artifact_path=made.artifact_location, run_id=run, model_id=made.model_id),
+            signature=signature(spec),
+            input_example=example(spec),
+            pip_requirements=REQUIREMENTS,
+            metadata=tags,
+        )
+        client.log_model_artifacts(made.model_id, local)
+    client.finalize_logged_model(made.model_id, "READY")
+    client.log_outputs(run, [LoggedModelOutput(made.model_id, step=spec.trainer.steps)])
+    return made
+
+
+def signature(spec: RunSpec) -> ModelSignature:
+    """The arrays that a policy takes and gives; -1 is the batch."""
+    size, real = sizes(spec), np.dtype("float32")
+    given: list[ColSpec | TensorSpec] = [
+        TensorSpec(array.dtype, (-1, *array.shape[1:]), name) for name, array in example(spec).items()
+    ]
+    shape = (-1, size.agents, size.actions) if size.continuous else (-1, size.agents)
+    return ModelSignature(Schema(given), Schema([TensorSpec(real if size.continuous else np.dtype("int64"), shape)]))
+
+
+def example(spec: RunSpec) -> dict[str, Any]:
+    """The observation at the start of one episode, without the parts that have no features."""
+    obs = make_env(spec.env, 1, torch.Generator().manual_seed(0)).reset()
+    return {name: part.numpy() for name, part in obs._asdict().items() if part.numel()}

@@ -1,0 +1,155 @@
+"""One episode of a policy as a small animation, beside another policy's if wanted."""
+
+import os
+import re
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import torch
+from torch import Generator, Tensor
+
+from pipelines import policy
+from pipelines.document import choices
+from pipelines.drawing import Panel, Scene, animation
+from pipelines.errors import InputError
+from pipelines.store import Home, StoreError
+from rhmc.envs import ENVS, EnvConfig
+from rhmc.scripted import SCRIPTED
+
+FRAMES, MILLISECONDS = 40, 110
+EPISODE, WHY_NOT = "episode.gif", "episode.txt"  # what a run keeps: an animation, or why there is none
+RUN = re.compile(r"[0-9a-f]{32}")  # how MLflow names a run
+
+Act = Callable[[Any], tuple[Tensor, Tensor | None]]  # state -> action (1, N[, A]) and assignment (1, N, M) if any
+
+
+def trained(actor: policy.Actor) -> Act:
+    """How a trained policy acts in a state."""
+    observe = ENVS[actor.env.kind][1].observe
+
+    def act(state: Any) -> tuple[Tensor, Tensor | None]:
+        action, extra = actor.act(observe(actor.env, state))
+        return action, extra.get("assignment")
+
+    return act
+
+
+def scripted(env: EnvConfig, name: str, episode: int) -> Act:
+    """How a policy without learning acts; its own draws have a generator of their own.
+
+    Raises:
+        InputError: the task has no such policy.
+    """
+    table = SCRIPTED[env.kind]
+    if name not in table:
+        raise InputError(f"--beside: '{name}' is not allowed; {choices(name, table)}")
+    own = Generator().manual_seed(episode)
+    return lambda state: (table[name](env, state, own), None)
+
+
+@torch.no_grad()
+def play(env: EnvConfig, act: Act, episode: int) -> list[Scene]:
+    """The scenes of one episode, start included. Start and target motion depend on `episode` alone."""
+    physics = ENVS[env.kind][1]
+    world = Generator().manual_seed(episode)
+    state = physics.initial(env, 1, world)
+    scenes, rewards, infos = [Scene(state, None, "step 0")], [], []
+    for step in range(1, physics.spec(env).episode + 1):
+        action, assignment = act(state)
+        state = physics.transition(env, state, action, world)
+        out = physics.outcome(env, state, action, assignment)
+        rewards.append(out.reward)
+        infos.append(out.info)
+        so_far = {key: torch.stack([info[key] for info in infos]) for key in infos[0]}
+        score = physics.summary(env, torch.stack(rewards), so_far)
+        text = f"step {step}: " + ", ".join(_words(name, float(value)) for name, value in _told(score).items())
+        scenes.append(Scene(state, None if assignment is None else assignment[0], text))
+    return scenes
+
+
+def _told(score: dict[str, Tensor]) -> dict[str, Tensor]:
+    names = ("return", "coverage", "landmarks_covered", "collisions")
+    return {name: score[name] for name in names if name in score}
+
+
+def _words(name: str, value: float) -> str:
+    if name == "landmarks_covered":
+        return f"{100 * value:.0f} % covered"
+    if name == "coverage":
+        return f"coverage so far {value:.1f} %"
+    return f"{value:.0f} bumps" if name == "collisions" else f"return {value:.1f}"
+
+
+def episode_gif(saved: policy.Saved, episode: int = 0, beside: str | None = None, frames: int = FRAMES) -> bytes:
+    """An episode of a trained policy as a GIF.
+
+    Args:
+        saved: whose.
+        episode: names the start and the target motion.
+        beside: also a policy without learning, in the same episode.
+        frames: at most so many.
+
+    Raises:
+        InputError: no such policy, or a state that this code cannot load.
+    """
+    env = saved.spec.env
+    others = {beside: scripted(env, beside, episode)} if beside else {}
+    try:
+        actor = policy.Actor(saved)
+    except ValueError as error:
+        raise InputError(f"the policy cannot be used: {error}") from error
+    acts = {f"{saved.spec.algo.kind}, seed {saved.spec.seed}": trained(actor)} | others
+    panels = [Panel(f"{name}, episode {episode}", play(env, act, episode)) for name, act in acts.items()]
+    return animation(env, panels, frames, MILLISECONDS)
+
+
+def render(what: str, out: Path, home: Home, episode: int = 0, beside: str | None = None, frames: int = FRAMES) -> Path:
+    """Write the animation of a run, by its id in MLflow, or of a checkpoint, by its path.
+
+    Raises:
+        InputError: what is given cannot be used; nothing is written.
+        StoreError: the file cannot be written.
+    """
+    if out.is_dir() or not out.parent.is_dir():
+        raise InputError(f"--out: {out} is a folder" if out.is_dir() else f"--out: {out.parent} is no folder")
+    path = Path(what)
+    if path.exists() or not RUN.fullmatch(what):
+        saved = policy.load(path)
+    else:
+        with TemporaryDirectory() as folder:
+            saved = policy.load(_fetch(what, home, Path(folder)))
+    torch.set_num_threads(saved.spec.trainer.threads)  # the actions of larger layers depend on it
+    write(out, episode_gif(saved, episode, beside, frames))
+    return out
+
+
+def _fetch(ref: str, home: Home, folder: Path) -> Path:
+    """The files of a run in the log, in a folder."""
+    from pipelines.mlflow_tracker import fetch  # 3 s
+
+    try:
+        found = fetch(ref, [policy.FILE, policy.CONFIG], home, folder)
+    except StoreError as error:
+        raise InputError(str(error)) from error
+    if policy.FILE not in found:
+        raise InputError(f"run {ref} keeps no {policy.FILE}: it is not finished")
+    return folder
+
+
+def write(path: Path, content: bytes) -> None:
+    """Write a file whole or not at all.
+
+    Raises:
+        StoreError: the folder cannot be written to, or the disk is full.
+    """
+    part = path.with_suffix(f".{os.getpid()}.part")
+    try:
+        part.write_bytes(content)
+        part.replace(path)
+    except OSError as error:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+        raise StoreError(f"{path}: cannot be written: {error.strerror or error}") from error

@@ -1,0 +1,252 @@
+"""What a person sees in MLflow: names, saved views, and the parent run of a study."""
+
+import base64
+import csv
+import io
+import json
+import zlib
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image
+
+from pipelines import mlflow_tracker, overview, views
+from pipelines.mlflow_tracker import MlflowTracker, addresses
+from pipelines.names import HEADLINES, full, shown
+from pipelines.overview import Overview, Run, figure, so_far, table
+from pipelines.store import Home
+from pipelines.tracker import Card, MemoryRun, MemoryTracker, StudyCard, points_of
+from tests.pipelines.support import plan
+
+STUDY = StudyCard("demo", "quick", "Why?\n\n- **slow**: the base", ("method", "algo.lr", "seed"))
+CARD = Card("full", 3, "5pec", "c0de", "iql", "coverage", "abc", {"method": "iql", "algo.lr": "0.1", "seed": "3"})
+POINT = {
+    "step": 0.0,
+    "eval/return": 1.0,
+    "eval/coverage": 2.0,
+    "eval/return_sem": 0.1,
+    "train/loss": 3.0,
+    "final/return": 4.0,
+    "time/steps_per_second": 50.0,
+    "time/seconds": 1.0,
+}
+
+
+# Names
+
+
+def test_headlines_stand_alone_and_the_rest_in_groups(home: Path) -> None:
+    tracker = MlflowTracker(STUDY, Home(home))
+    log = tracker.start(CARD)
+    log.log([POINT])
+    names = set(tracker.client.get_run(log.ref).data.metrics)
+    assert {name for name in names if "/" not in name} == {"return", "coverage", "steps_per_second"}
+    assert names >= {"eval/return_sem", "train/loss", "final/return", "time/seconds"}
+    assert points_of(tracker.rows([log.ref])) == [POINT]
+    assert points_of(tracker._rows_client([log.ref])) == [POINT]
+
+
+def test_a_log_with_the_former_names_is_read_and_continued_without_doubles(home: Path) -> None:
+    tracker = MlflowTracker(STUDY, Home(home))
+    log = tracker.start(CARD)
+    tracker.client.log_metric(log.ref, "eval/return", 1.0, step=0)
+    again = MlflowTracker(STUDY, Home(home)).start(CARD)
+    again.log([{"step": 0.0, "eval/return": 1.0}, {"step": 8.0, "eval/return": 2.0}])
+    assert [(row.step, row.metric, row.value) for row in tracker.rows([log.ref])] == [
+        (0, "eval/return", 1.0),
+        (8, "eval/return", 2.0),
+    ]
+    assert tracker.client.get_run(log.ref).data.metrics == {"eval/return": 1.0, "return": 2.0}
+
+
+@pytest.mark.parametrize("metric", [*HEADLINES.values(), "train/loss", "final/return"])
+def test_a_name_comes_back(metric: str) -> None:
+    assert full(shown(metric)) == metric
+    assert full(metric) == metric
+
+
+# Saved views
+
+
+def unpacked(tag: str) -> dict[str, Any]:
+    """The state in the value of a tag, as the web interface reads it."""
+    envelope = json.loads(tag)
+    kind, packed = envelope["state"].split(";", 1)
+    assert kind == "deflate"
+    assert isinstance(envelope["name"], str)
+    assert isinstance(envelope["createdAt"], int)
+    state: dict[str, Any] = json.loads(zlib.decompress(base64.b64decode(packed)))
+    return state
+
+
+def test_a_view_is_a_tag_that_unpacks_to_its_state() -> None:
+    for view in views.views(["method", "algo.lr", "seed"]):
+        assert unpacked(view.written(5)) == view.state
+        assert len(view.written(5)) < 20_000  # what MLflow takes
+        assert view.written(5) == view.written(5)
+
+
+def test_charts_are_grouped_by_arm_and_show_the_headlines_first() -> None:
+    curves, finals, every = views.views(["method", "algo.lr", "seed"])
+    for view in (curves, finals):
+        assert view.state["groupBy"]["groupByKeys"] == [{"mode": "tag", "groupByData": "variant"}]
+    assert every.state["groupBy"] is None
+    lines = [chart["metricKey"] for chart in curves.state["compareRunCharts"] if chart["type"] == "LINE"]
+    assert lines == ["return", "coverage", "landmarks_covered", "collisions", "steps_per_second"]
+    parallel = every.state["compareRunCharts"][0]
+    assert (parallel["selectedParams"], parallel["selectedMetrics"]) == (
+        ["method", "algo.lr", "seed"],
+        ["final/return"],
+    )
+    assert "params.`algo.lr`" in finals.state["selectedColumns"]
+
+
+@pytest.mark.parametrize("view", views.views(["seed"]), ids=lambda view: view.key)
+def test_every_chart_is_in_a_section_and_has_a_name_of_its_own(view: views.View) -> None:
+    sections = [section["uuid"] for section in view.state.get("compareRunSections", [])]
+    charts = view.state.get("compareRunCharts", [])
+    assert {chart["metricSectionId"] for chart in charts} <= set(sections)
+    assert len({chart["uuid"] for chart in charts}) == len(charts)
+    assert len(set(sections)) == len(sections)
+
+
+def test_a_study_has_its_views_as_it_opens(home: Path) -> None:
+    tracker = MlflowTracker(STUDY, Home(home))
+    tags = tracker.client.get_experiment(tracker.experiment).tags
+    for view in views.views(STUDY.params):
+        assert unpacked(tags[view.tag]) == view.state
+    found = addresses(tracker.uri, "http://127.0.0.1:5000")
+    assert [(name, view) for name, view, _ in found] == [
+        ("demo (quick)", "Curves by arm"),
+        ("demo (quick)", "Finals by arm"),
+        ("demo (quick)", "Every run"),
+    ]
+    start = f"http://127.0.0.1:5000/#/experiments/{tracker.experiment}/runs?workflowType=machine_learning"
+    assert found[0][2] == f"{start}&viewStateShareKey=rhmc-curves&compareRunsMode=CHART"
+    assert found[1][2] == f"{start}&viewStateShareKey=rhmc-finals&compareRunsMode=TABLE"
+
+
+def test_a_study_that_was_logged_without_views_gets_them_when_it_is_shown(home: Path) -> None:
+    tracker = MlflowTracker(STUDY, Home(home))
+    tracker.start(CARD)
+    for view in views.views([]):
+        tracker.client.delete_experiment_tag(tracker.experiment, view.tag)
+    assert len(addresses(tracker.uri, "")) == 3
+    tags = tracker.client.get_experiment(tracker.experiment).tags
+    state = unpacked(tags["mlflow.sharedViewState.rhmc-parallel"])
+    assert sorted(state["compareRunCharts"][0]["selectedParams"]) == ["algo.lr", "method", "seed"]
+
+
+def test_an_experiment_of_somebody_else_is_left_alone(home: Path) -> None:
+    tracker = MlflowTracker(STUDY, Home(home))
+    theirs = tracker.client.create_experiment("theirs")
+    assert {name for name, _, _ in addresses(tracker.uri, "")} == {"demo (quick)"}
+    assert not any(tag.startswith(views.TAG) for tag in tracker.client.get_experiment(theirs).tags)
+
+
+def test_an_empty_file_is_not_made_a_store(tmp_path: Path) -> None:
+    (tmp_path / "empty.db").touch()
+    assert addresses(f"sqlite:///{tmp_path}/empty.db", "") == []
+    assert (tmp_path / "empty.db").stat().st_size == 0
+
+
+# The parent run
+
+RUNS = [
+    Run("full", 0, "finished", [(0, 1.0), (8, 3.0)], {"final/return": 60.0, "final/coverage": 61.0}),
+    Run("full", 1, "finished", [(0, 2.0), (8, 5.0)], {"final/return": 64.0, "final/coverage": 65.0}),
+    Run("full", 2, "running", [(0, 9.0)], {}),
+    Run("no filter", 0, "finished", [(0, 0.0), (8, 1.0)], {"final/return": 50.0, "final/coverage": 51.0}),
+    Run("no filter", 1, "failed", [], {}),
+    Run("no filter", 2, None, [], {}),
+]
+
+
+def test_the_description_says_what_is_there_and_what_is_not() -> None:
+    lines = so_far(RUNS).splitlines()
+    assert "3 of 6 runs are finished; the highest mean final return is that of **full**." in so_far(RUNS)
+    assert lines[-4] == "| arm | finished seeds | others | final return | final coverage |"
+    assert lines[-3] == "|---|---|---|---|---|"
+    assert lines[-2] == "| full | 0, 1 | running: 2 | 62.00 (60.00 to 64.00) | 63.00 (61.00 to 65.00) |"
+    assert lines[-1] == "| no filter | 0 | failed: 1; missing: 2 | 50.00 | 51.00 |"
+
+
+def test_nobody_is_ahead_before_two_arms_have_a_result() -> None:
+    assert "0 of 1 runs are finished." in so_far(RUNS[-1:])
+    assert "highest" not in so_far(RUNS[:3])
+
+
+def test_a_bar_in_a_name_does_not_break_the_table() -> None:
+    assert "| a\\|b | none | missing: 0 |" in so_far([Run("a|b", 0, None, [], {})])
+
+
+def test_the_table_has_every_planned_run() -> None:
+    rows = list(csv.reader(io.StringIO(table(RUNS))))
+    assert rows[0] == ["arm", "seed", "status", "final/return", "final/coverage"]
+    assert rows[1] == ["full", "0", "finished", "60.0", "61.0"]
+    assert rows[-1] == ["no filter", "2", "missing", "", ""]
+    assert len(rows) == 1 + len(RUNS)
+
+
+def test_a_curve_is_of_the_finished_seeds_at_the_steps_that_all_have() -> None:
+    assert overview._common(RUNS[:3]) == (2, [0, 8], [[1.0, 2.0], [3.0, 5.0]])
+    begun = [run._replace(status="running") for run in RUNS[:3]]
+    assert overview._common(begun) == (3, [0], [[1.0, 2.0, 9.0]])
+    assert overview._common(RUNS[4:]) is None
+
+
+def test_the_figure_is_a_picture_and_the_same_every_time() -> None:
+    picture = figure(STUDY, RUNS)
+    assert Image.open(io.BytesIO(picture)).size == (880, 495)
+    assert figure(STUDY, RUNS) == picture
+
+
+def test_the_overview_follows_a_launch_and_finds_what_an_earlier_one_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(overview, "PAUSE", 0.0)
+    shelf: list[MemoryRun] = []
+    runs = plan()
+    slow, fast = runs
+    tracker = MemoryTracker(STUDY, shelf)
+    log = tracker.start(slow.card)
+    log.log([{"step": 0.0, "eval/return": 1.0}, {"step": 8.0, "eval/return": 2.0, "final/return": 2.5}])
+    log.finish("finished")
+
+    tracker = MemoryTracker(STUDY, shelf)
+    follows = Overview(STUDY, runs, tracker)
+    follows.describe()
+    assert tracker.files == {}
+    assert tracker.note.startswith("Why?\n\n- **slow**: the base")
+    assert "| slow | 0 |  | 2.50 |" in tracker.note
+    assert "| fast | none | missing: 0 | – |" in tracker.note
+    follows.points("fast", fast.key, [{"step": 0.0, "eval/return": 3.0}])
+    follows.points("fast", fast.key, [{"step": 8.0, "eval/return": 4.0, "final/return": 4.5}])
+    follows.ended("fast", fast.key, "finished")
+    assert "| fast | 0 |  | 4.50 |" in tracker.note
+    assert "**fast**" in tracker.note
+    assert sorted(tracker.files) == ["curves.png", "finals.csv"]
+    assert tracker.files["finals.csv"].decode().splitlines()[2] == "fast,0,finished,4.5"
+
+
+def test_refreshes_keep_a_distance(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, told = [100.0], []
+    monkeypatch.setattr(overview.time, "monotonic", lambda: now[0])
+    tracker = MemoryTracker(STUDY, [])
+    monkeypatch.setattr(tracker, "publish", lambda note, files: told.append(now[0]))
+    slow, fast = plan()
+    follows = Overview(STUDY, [slow, fast], tracker)
+    for now[0] in (100.0, 110.0, 129.0, 131.0):
+        follows.ended("slow", slow.key, "failed")
+    assert told == [100.0, 131.0]
+
+
+def test_what_is_published_is_on_the_parent_run_and_replaces_the_former(home: Path) -> None:
+    tracker = MlflowTracker(STUDY, Home(home))
+    tracker.publish("first", {"finals.csv": b"a\n"})
+    tracker.publish("**second**", {"finals.csv": b"b\n"})
+    parent = tracker.client.get_run(tracker.parent)
+    assert parent.data.tags[mlflow_tracker.NOTE] == "**second**"
+    assert tracker.client.get_experiment(tracker.experiment).tags[mlflow_tracker.NOTE] == "**second**"
+    kept = tracker.file(tracker.parent, "finals.csv", home)
+    assert kept is not None
+    assert kept.read_bytes() == b"b\n"
