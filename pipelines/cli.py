@@ -301,7 +301,7 @@ def methods(
 def drawings(
     out: Annotated[Path, typer.Option(help="Folder; made if it is not there.")] = Path("reports/quick/runs"),
 ) -> None:
-    """Write what the drawn figures show: RHMC's networks as they run, and states of both tasks (Figures 1 to 5 and 8)."""
+    """Write what Figures 1 to 5 and 8 show: RHMC's networks as they run, and states of both tasks."""
     from pipelines.drawings import export_drawings
     from pipelines.store import StoreError
 
@@ -334,9 +334,7 @@ def report(
     study: Annotated[Path | None, typer.Option(metavar="FILE", help="Report on this study alone.")] = None,
     variant: Annotated[str | None, typer.Option(help="Of that study.")] = None,
     runs: Annotated[Path | None, typer.Option(help="Exported tables; reports/<profile>/runs if not given.")] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="Folder; reports/<profile>[/study/<name>] if not given.")
-    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder; reports/<profile>[/study/<name>] if not given.")] = None,
 ) -> None:
     """Build figures, tables, claims and their page from the exported tables; or curves and comparison of one study."""
     if study is not None and not study.is_file():

@@ -242,7 +242,7 @@ def _content(report: Report, pictures: Path) -> Mapping[str, Any]:
 
 
 def _first_seen(runs: Table) -> Iterator[tuple[str, bool]]:
-    """Run ids in the order of the table, and whether it is the first row with that id: one run may be in two studies."""
+    """Run ids in the order of the table, and whether it is the first row of that run: it may stand in two studies."""
     seen: set[str] = set()
     for run in runs.numbers["run"].astype(str):
         yield run, run not in seen

@@ -325,8 +325,8 @@ def c13(see: Evidence) -> Finding:
         return Finding("reproduced", f"No loss in {table['instances'].sum():,.0f} instances.", ours)
     share = 100 * table["lost"] / table["instances"]
     reason = (
-        f"Below the optimum in {share.min():.1f} % to {share.max():.1f} % of random instances, by size and density, and "
-        f"by up to {table['max_gap'].max():.2f} of reward."
+        f"Below the optimum in {share.min():.1f} % to {share.max():.1f} % of random instances, by size and density, "
+        f"and by up to {table['max_gap'].max():.2f} of reward."
     )
     return Finding("not reproduced", reason, ours)
 

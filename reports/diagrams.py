@@ -1,6 +1,7 @@
 """Figures 1 to 3: RHMC's networks with the layers, widths and parameters that they were found to have."""
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import pandas as pd
@@ -129,7 +130,7 @@ def numbers(builds: Sequence[Build], roles: Sequence[str]) -> pd.DataFrame:
 def widths(network: Network) -> str:
     """`80 → 64 → 64 → 20` of a chain; of a branched network its first and last width and the number of layers."""
     linear = [layer for layer in network.layers if layer.parameters]
-    if all(a.width_out == b.width_in for a, b in zip(linear, linear[1:], strict=False)):
+    if all(a.width_out == b.width_in for a, b in pairwise(linear)):
         return " → ".join(str(x) for x in [linear[0].width_in, *(layer.width_out for layer in linear)])
     return f"{linear[0].width_in} → … → {linear[-1].width_out}, {len(linear)} layers"
 

@@ -1,4 +1,4 @@
-"""Learning curves as figures: all arms of a study in one frame, and beside that a frame for each arm where they are many.
+"""Learning curves as figures: all arms of a study in one frame, and where they are many a frame for each beside it.
 
 Same numbers in, same bytes out: Agg, fixed style, no dates.
 """

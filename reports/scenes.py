@@ -65,7 +65,8 @@ def coverage(found: Sequence[Coverage]) -> Drawing:
     with styled():
         figure = blank(9.6, 1.0 + 3.45 * rows)
         first = found[0]
-        words = f"{len(first.targets)} targets; step {first.step} of an episode, scripted policy: {first.policy.replace('_', ' ')}"
+        policy = first.policy.replace("_", " ")
+        words = f"{len(first.targets)} targets; step {first.step} of an episode, scripted policy: {policy}"
         head(figure, "Sensor coverage with different numbers of sensors", words)
         inches = 1.0 + 3.45 * rows
         for n, state in enumerate(found):
@@ -110,7 +111,7 @@ def _path_words(name: str, path: Joint) -> str:
 
 
 def _regulation_words(found: Regulation) -> str:
-    return f"an instance met in coverage: horizon {found.horizon} steps, α = {found.alpha:g}; options that differ, once each"
+    return f"met in coverage: horizon {found.horizon} steps, α = {found.alpha:g}; options that differ, once each"
 
 
 def _regulation_numbers(found: Regulation) -> pd.DataFrame:

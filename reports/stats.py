@@ -121,7 +121,7 @@ def improvement(x: Values, y: Values) -> Interval:
 
 
 def welch(x: Values, y: Values) -> float:
-    """Two-sided p of Welch's test that two independent samples have one mean; NaN below two values or without spread."""
+    """Two-sided p of Welch's test that two samples have one mean; NaN below two values or without any spread."""
     if min(len(x), len(y)) < 2 or (np.ptp(x) == 0 and np.ptp(y) == 0):
         return float("nan")
     return float(ttest_ind(x, y, equal_var=False).pvalue)
