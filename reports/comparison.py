@@ -113,7 +113,7 @@ def efficiency(results: Results, study: str) -> Table | None:
             }
         )
     note = (
-        f"Level: {number(level.value)}, {level.words}. Steps: the first evaluation at or above it, of each finished seed, "
+        f"Level: {number(level.value)}, {level.words}. Steps: to each finished seed's first evaluation at or above it, "
         "given where every seed reaches it. Processor time: that share of the run's seconds."
     )
     return Table(f"Sample efficiency, study {study}", pd.DataFrame(numbers), pd.DataFrame(shown), note)
