@@ -11,7 +11,6 @@ import torch
 from torch import Generator, Tensor, nn
 
 from rhmc import executor
-from rhmc.algorithms import ALGORITHMS
 from rhmc.algorithms.rhmc import RHMC, Config
 from rhmc.coordinator import worth
 from rhmc.envs import coverage, make_env
@@ -59,7 +58,7 @@ def _build(encoder: str, observation: str) -> Record:
     task = make_env(env, 1, Generator().manual_seed(0))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        method: RHMC = ALGORITHMS["rhmc"].build(cfg, task.spec, 1, Generator())
+        method = RHMC(cfg, task.spec, 1, Generator())
     networks = list(_networks(method, task.reset()))
     shaping = ("filter", "regulator", "horizon", "alpha", "assignment_period", "hidden", "share")
     settings = {name: getattr(cfg, name) for name in shaping}

@@ -179,14 +179,14 @@ def matrix(results: Results, study: str) -> Drawing | None:
         width, height = figure.get_size_inches()
         head(figure, f"Probability of improvement, study {study}", "that a seed of the row beats one of the column")
         axes = figure.add_axes((left / width, 0.45 / height, side / width, side / height))
-        axes.imshow(table, cmap="RdBu", vmin=0, vmax=1, aspect="auto")
+        axes.imshow(table, cmap="RdBu", vmin=-0.3, vmax=1.3, aspect="auto")
         axes.grid(visible=False)
         axes.set_xticks(range(len(arms)), arms, rotation=35, ha="left", rotation_mode="anchor", fontsize=8)
         axes.set_yticks(range(len(arms)), arms, fontsize=8)
         axes.xaxis.tick_top()
         for (i, j), value in np.ndenumerate(table):
             if i != j:
-                colour = "white" if abs(value - 0.5) > 0.35 else "black"
+                colour = "white" if abs(value - 0.5) > 0.45 else "black"
                 axes.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=7.5, color=colour)
         foot(figure, "Blue: the row wins; red: the column. Intervals stand in the table of pairs.")
     rows = [(a, b, table[i, j]) for i, a in enumerate(arms) for j, b in enumerate(arms) if i != j]

@@ -88,7 +88,7 @@ def architecture(builds: Sequence[Build]) -> Drawing:
             ((6.2, 2.4), (3.2, 4.0), "joint action", (2.0, 2.8)),
         ):
             _arrow(axes, start, end)
-            axes.text(*at, words, fontsize=8, color=QUIET)
+            axes.text(at[0], at[1], words, fontsize=8, color=QUIET)
         axes.plot([10.5, 14.8], [5.9, 5.9], color=QUIET, linewidth=1.1)
         foot(
             figure, "Traced from the built networks; slow copies not shown. Widths: features in → units of each layer."

@@ -12,6 +12,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
+from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
 from reports.canvas import FAINT, MARGIN, QUIET, Drawing, blank, foot, head, look, save, styled
@@ -203,9 +204,9 @@ def _draw_curve(axes: Axes, rows: pd.DataFrame, colour: str, dashes: str) -> Non
     axes.fill_between(rows["step"], rows["low"], rows["high"], color=colour, alpha=0.16, linewidth=0, zorder=3)
 
 
-def _name_frame(axes: Axes, arm: str, finals: Sequence[float]) -> None:
+def _name_frame(axes: Axes, arm: str, finals: NDArray[np.float64]) -> None:
     """Name and final return above a small frame."""
-    words = number(float(np.mean(finals))) if len(finals) else "unfinished"
+    words = number(float(finals.mean())) if len(finals) else "unfinished"
     axes.set_title("\n".join(wrap(f"{arm}: {words}", 27)), fontsize=7.5, loc="left", fontweight="bold", pad=3)
     axes.xaxis.set_major_locator(MaxNLocator(3))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: steps(x)))

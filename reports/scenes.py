@@ -135,7 +135,16 @@ def _navigation_panel(axes: Axes, found: Navigation, step: int) -> None:
         colour = AGENTS[i % len(AGENTS)]
         axes.plot(ways[:, i, 0], ways[:, i, 1], color=colour, linewidth=1.2, alpha=0.6, zorder=3)
         axes.add_patch(Circle(ways[step, i], found.radius, facecolor=colour, alpha=0.75, zorder=4))
-        axes.text(*ways[step, i], str(i + 1), color="white", fontsize=8, ha="center", va="center", zorder=5)
+        axes.text(
+            ways[step, i, 0],
+            ways[step, i, 1],
+            str(i + 1),
+            color="white",
+            fontsize=8,
+            ha="center",
+            va="center",
+            zorder=5,
+        )
     reach = max(1.15, float(np.abs(np.asarray(found.positions)).max()) + 0.2)
     axes.set_xlim(-reach, reach)
     axes.set_ylim(-reach, reach)
@@ -148,7 +157,7 @@ def _coverage_panel(axes: Axes, state: Coverage) -> None:
         ends = (heading - state.half_view, heading + state.half_view)
         axes.add_patch(Wedge((x, y), state.range, *ends, facecolor=colour, alpha=0.16, edgecolor=colour, zorder=2))
         axes.plot([x], [y], marker="s", color=colour, markersize=6, zorder=4)
-    seen = np.asarray(state.seen).any(0)
+    seen = np.asarray(state.seen).any(0).tolist()
     for (x, y), in_sight in zip(state.targets, seen, strict=True):
         axes.plot([x], [y], marker="o", color=INK, fillstyle="full" if in_sight else "none", markersize=6, zorder=5)
     edge = state.half_area * 1.04
