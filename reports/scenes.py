@@ -157,7 +157,7 @@ def _coverage_panel(axes: Axes, state: Coverage) -> None:
         ends = (heading - state.half_view, heading + state.half_view)
         axes.add_patch(Wedge((x, y), state.range, *ends, facecolor=colour, alpha=0.16, edgecolor=colour, zorder=2))
         axes.plot([x], [y], marker="s", color=colour, markersize=6, zorder=4)
-    seen = np.asarray(state.seen).any(0).tolist()
+    seen = [any(of_target) for of_target in zip(*state.seen, strict=True)]
     for (x, y), in_sight in zip(state.targets, seen, strict=True):
         axes.plot([x], [y], marker="o", color=INK, fillstyle="full" if in_sight else "none", markersize=6, zorder=5)
     edge = state.half_area * 1.04
