@@ -36,7 +36,7 @@ setup: $(READY) ## The environment in .venv, exactly as in requirements.lock
 repro: $(READY) ## Train, track and report on the profile in params.yaml; an interrupted one continues
 	@dvc repro || { echo "Not finished. What is done is kept: \`make repro\` continues."; exit 1; }
 	@echo
-	@echo "Report:    reports/$(PROFILE)/index.md"
+	@echo "Report:    reports/$(PROFILE)/index.html"
 	@echo "MLflow UI: run \`make ui\` and open the address that it prints"
 
 test: check ## Lint, types and every test

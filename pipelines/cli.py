@@ -16,7 +16,7 @@ from pipelines.errors import InputError
 
 EXIT_CODES = (
     "Exit codes: 0 done; 1 a run failed or is not finished, or something is wrong; 2 bad input, nothing was started; "
-    "130 interrupted. Results are kept in $RHMC_HOME, or in the folder work."
+    "130 interrupted; 143 terminated. Results are kept in $RHMC_HOME, or in the folder work."
 )
 
 app = typer.Typer(
@@ -36,6 +36,7 @@ app.command("report", rich_help_panel=RESULTS)(science.report)
 app.command("ui", rich_help_panel=RESULTS)(ui.ui)
 app.command("theorem", rich_help_panel=RESULTS)(science.theorem)
 app.command("methods", rich_help_panel=CODE)(science.methods)
+app.command("drawings", rich_help_panel=CODE)(science.drawings)
 app.command("fingerprint", rich_help_panel=CODE)(science.fingerprint)
 app.command("doctor", rich_help_panel=CODE)(doctor.doctor)
 

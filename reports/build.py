@@ -5,111 +5,175 @@ import json
 import math
 import shutil
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
 
 from reports import claims as rules
-from reports import figures, tables
+from reports import comparison, page, scaling, tables
+from reports.canvas import save
 from reports.claims import VERDICTS, Claim
 from reports.frame import Results, TableError, load
-from reports.paper import Curves, Paper, read
+from reports.gallery import Picture, gallery, study_gallery
+from reports.paper import Paper, read
 from reports.stats import FEW
 from reports.tables import Table, joined, steps
 
-MADE = ("figures", "tables", "claims.md", "claims.csv", "claims.json", "index.md")
+MADE = ("figures", "tables", "claims.md", "claims.csv", "claims.json", "index.md", "index.html")
 
-DEFINITIONS = f"""\
-- **Final return**: mean over seeds of `final/return`, the greedy policy after the last step on a bank of episodes that
-  no curve uses. Coverage: 100 × mean reward per step; navigation: sum over an episode.
-- **Curve**: mean over seeds of `eval/return`, the greedy policy on a smaller fixed bank, on one grid of steps. Faint
-  where fewer seeds have come so far.
-- **[95 %]**: bootstrap over seeds (40 000 resamples, one fixed generator), the percentile interval widened to the width
-  of Student's t. With fewer than {FEW} seeds it is narrower than its name (three seeds: their range, which holds the
-  true mean in about 3 of 4 cases).
-- **IQM**: mean without the lowest and the highest quarter of seeds; with fewer than four seeds that is the mean.
-- **Change**: of the mean against full RHMC, in percent. **P(full better)**: probability that a random seed of full RHMC
-  beats a random one of the other arm.
-- **provisional**: the verdict rests on less than the paper's training budget or on fewer than {FEW} seeds.
-"""
+DEFINITIONS = (
+    (
+        "Final return",
+        "mean over seeds of final/return, the greedy policy after the last step on a bank of episodes that no curve "
+        "uses. Coverage: 100 × mean reward per step; navigation: sum over an episode.",
+    ),
+    (
+        "Curve",
+        "mean over seeds of eval/return, the greedy policy on a smaller fixed bank, on one grid of steps. Faint where "
+        "fewer seeds have come so far.",
+    ),
+    (
+        "[95 %]",
+        "bootstrap over seeds (40 000 resamples, one fixed generator), the percentile interval widened to the width of "
+        f"Student's t. With fewer than {FEW} seeds it is narrower than its name (three seeds: their range, which holds "
+        "the true mean in about 3 of 4 cases).",
+    ),
+    ("IQM", "mean without the lowest and the highest quarter of seeds; with fewer than four seeds that is the mean."),
+    ("Change", "of the mean against full RHMC, in percent."),
+    (
+        "P(full better), P(first better)",
+        "probability that a random seed of the first arm beats a random one of the other, with Newcombe's score "
+        "interval. A bootstrap would say [0, 0] or [1, 1] where every seed of one arm wins. Three seeds that all win "
+        "against three can show no more than [0.50, 1.00].",
+    ),
+    ("provisional", f"the verdict rests on less than the paper's training budget or on fewer than {FEW} seeds."),
+)
 
 
-def build(runs: Path, out: Path, profile: str) -> list[Path]:
+COMPLETE = "Nothing: every planned run is finished."
+DRAWN = "rhmc drawings"
+
+
+class Report(NamedTuple):
+    """Everything that is written, before it is."""
+
+    results: Results
+    title: str
+    lead: str
+    pictures: list[Picture]
+    tables: dict[str, Table]
+    claims: list[Claim]
+    gaps: list[str]
+
+
+def build(runs: Path, out: Path, profile: str, study: str | None = None) -> list[Path]:
     """Read the tables in `runs`, write the report to `out`, and return its files.
 
     Everything is made in a folder beside the old report first, so that a failure leaves the old one as it was.
 
+    Args:
+        runs: folder of the exported tables.
+        out: folder of the report.
+        profile: that made the runs.
+        study: the one study to report on, without the paper's claims; None for the whole report.
+
     Raises:
         TableError: the tables are missing or faulty; nothing is written.
     """
-    results, paper = load(runs, profile), read()
+    results, paper = load(runs, profile, study), read()
+    made = _whole(results, paper) if study is None else _single(results, paper, study)
     out.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(prefix=".report-", dir=out) as folder:
-        _write(results, paper, Path(folder))
-        for name in MADE:
+        _write(made, Path(folder))
+        names = [name for name in MADE if (Path(folder) / name).exists()]
+        for name in names:
             _replace(Path(folder) / name, out / name)
-    return sorted(path for name in MADE for path in [out / name, *(out / name).rglob("*")] if path.is_file())
+    return sorted(path for name in names for path in [out / name, *(out / name).rglob("*")] if path.is_file())
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Build the report of a profile from its exported tables. Returns 0, or 2 if the tables are faulty."""
     parser = argparse.ArgumentParser(prog="python -m reports.build", description=main.__doc__)
     parser.add_argument("--profile", default="quick", help="profile that made the runs (default: quick)")
+    parser.add_argument("--study", help="report on this study alone")
     parser.add_argument("--runs", type=Path, help="folder of the tables (default: reports/PROFILE/runs)")
-    parser.add_argument("--out", type=Path, help="folder of the report (default: reports/PROFILE)")
+    parser.add_argument("--out", type=Path, help="folder of the report (default: reports/PROFILE[/study/STUDY])")
     args = parser.parse_args(argv)
     home = Path("reports") / args.profile
+    out = args.out or (home / "study" / args.study if args.study else home)
     try:
-        files = build(args.runs or home / "runs", args.out or home, args.profile)
+        files = build(args.runs or home / "runs", out, args.profile, args.study)
     except TableError as error:
         print(error, file=sys.stderr)
         return 2
-    print(f"{len(files)} files; start with {(args.out or home) / 'index.md'}")
+    print(f"{len(files)} files; start with {out / 'index.html'}")
     return 0
 
 
-def _write(results: Results, paper: Paper, folder: Path) -> None:
+def _whole(results: Results, paper: Paper) -> Report:
+    gaps = [] if results.methods else ["Table 1: no methods; `rhmc methods --out` writes them."]
+    gaps += [] if results.modules else ["Figures 1 to 3: no networks; `rhmc drawings --out` writes them."]
+    gaps += [] if results.scenes else ["Figures 4, 5 and 8: no scenes; `rhmc drawings --out` writes them."]
+    gaps += results.gaps(paper.arms | {scaling.STUDY: ()})
+    title = f"Does it hold? The paper's results, profile {results.profile}"
+    pictures, claims = gallery(results, paper), rules.judge(results, paper)
+    return Report(results, title, _lead(results), pictures, _tables(results, paper), claims, gaps)
+
+
+def _single(results: Results, paper: Paper, study: str) -> Report:
+    made = _study_tables(results, study) | {"runs": tables.runs(_alone(results))}
+    title = f"Study {study}, profile {results.profile}"
+    lead = f"{_question(results, study)} {_lead(results)}"
+    return Report(results, title, lead, study_gallery(results, paper, study), made, [], results.gaps({}))
+
+
+def _write(report: Report, folder: Path) -> None:
     pictures, sheets = folder / "figures", folder / "tables"
     pictures.mkdir()
     sheets.mkdir()
-    drawn = {}
-    for name, spec in _figures(results, paper).items():
-        drawing = figures.learning_curves(results, spec)
-        if drawing:
-            figures.save(drawing, pictures, name)
-            drawn[name] = spec
-    made = _tables(results, paper)
-    for name, table in made.items():
+    for picture in report.pictures:
+        save(picture.drawing, pictures, picture.name)
+    for name, table in report.tables.items():
         _save(table, sheets, name)
-    found = rules.judge(results, paper)
+    if report.claims:
+        _write_claims(report.claims, folder)
+    (folder / "index.md").write_text("\n".join(_index(report)) + "\n")
+    (folder / "index.html").write_text(page.render(_content(report, pictures)))
+
+
+def _write_claims(found: Sequence[Claim], folder: Path) -> None:
     listed = rules.table(found)
     listed.numbers.to_csv(folder / "claims.csv", index=False, lineterminator="\n")
-    (folder / "claims.json").write_text(
-        json.dumps([_plain(claim) for claim in found], indent=1, ensure_ascii=False) + "\n"
-    )
+    plain = json.dumps([_plain(claim) for claim in found], indent=1, ensure_ascii=False)
+    (folder / "claims.json").write_text(plain + "\n")
     (folder / "claims.md").write_text("\n".join(_claims_page(found, listed)) + "\n")
-    captions = {name: _caption(name, spec) for name, spec in drawn.items()}
-    (folder / "index.md").write_text("\n".join(_index(results, paper, captions, listed, made)) + "\n")
-
-
-def _figures(results: Results, paper: Paper) -> dict[str, Curves]:
-    """The paper's figures of curves, then one for each study that the paper does not have."""
-    others = [study for study in results.studies if study not in {spec.study for spec in paper.figures.values()}]
-    return paper.figures | {
-        f"curves_{study}": paper.curves_of(study, results.env(study).get("kind", "")) for study in others
-    }
 
 
 def _tables(results: Results, paper: Paper) -> dict[str, Table]:
     """Tables by file name; those with nothing to show are left out."""
     made = {"table_1": tables.table_1(results)} if results.methods else {}
     made |= {"table_2": tables.table_2(results, paper)} if results.arms("ablation") else {}
-    made |= {f"final_{study}": tables.finals(results, study) for study in results.studies}
-    made |= {
-        f"steadiness_{study}": t for study in results.studies if len((t := tables.steadiness(results, study)).shown)
-    }
+    for study in results.studies:
+        made |= _study_tables(results, study)
     made |= {"yardsticks": tables.yardsticks(results)} if results.yardsticks else {}
+    shortfall = tables.theorem(results)
+    made |= {"theorem": shortfall} if shortfall else {}
     return made | {"runs": tables.runs(results)}
+
+
+def _study_tables(results: Results, study: str) -> dict[str, Table]:
+    """What is shown of every study."""
+    found = scaling.sweep(results, study)
+    steadiness = tables.steadiness(results, study)
+    every: dict[str, Table | None] = {
+        "final": tables.finals(results, study),
+        "pairs": comparison.pairs_table(results, study),
+        "efficiency": comparison.efficiency(results, study),
+        "steadiness": steadiness if len(steadiness.shown) else None,
+        "agents": scaling.table(results, found) if found else None,
+    }
+    return {f"{name}_{study}": table for name, table in every.items() if table}
 
 
 def _save(table: Table, folder: Path, name: str) -> None:
@@ -118,38 +182,122 @@ def _save(table: Table, folder: Path, name: str) -> None:
     (folder / f"{name}.tex").write_text(table.latex())
 
 
-def _index(
-    results: Results, paper: Paper, captions: dict[str, str], claims: Table, made: dict[str, Table]
-) -> Iterator[str]:
-    yield f"# Results, profile `{results.profile}`\n"
+def _index(report: Report) -> Iterator[str]:
+    results = report.results
+    yield f"# {report.title}\n"
+    yield "The same with everything in one page: `index.html`.\n"
     yield f"{_summary(results)}\n"
-    gaps = [] if results.methods else ["Table 1: no methods; `rhmc methods --out` writes them."]
-    gaps += results.gaps(paper.arms)
-    if gaps:
+    if report.gaps:
         yield "Not everything is there yet: see [what is missing](#what-is-missing).\n"
-    yield "## Learning curves\n"
-    for name, caption in captions.items():
-        yield f"![{caption}](figures/{name}.png)\n"
-        yield f"*{caption}.* [PDF](figures/{name}.pdf), [numbers](figures/{name}.csv)\n"
-    if not captions:
+    yield "## Figures\n"
+    for picture in report.pictures:
+        yield f"![{picture.heading}](figures/{picture.name}.png)\n"
+        yield f"*{picture.heading}.* {picture.caption} {_links('figures', picture.name, 'PDF', 'numbers')}\n"
+    if not report.pictures:
         yield "No study has a curve yet.\n"
-    yield "## The paper's claims\n"
-    yield f"{_count(claims)} A rule computes each verdict: [claims.md](claims.md) prints it beside the runs used.\n"
-    yield f"{claims.markdown()}\n"
-    for name, table in made.items():
+    if report.claims:
+        listed = rules.table(report.claims)
+        yield "## The paper's claims\n"
+        yield f"{_count(listed)} A rule computes each verdict: [claims.md](claims.md) prints it beside the runs used.\n"
+        yield f"{listed.markdown()}\n"
+    for name, table in report.tables.items():
         if name != "runs":
             yield f"## {table.title}\n"
             if table.note:
                 yield f"{table.note}\n"
             yield f"{table.markdown()}\n"
-            yield f"[CSV](tables/{name}.csv), [LaTeX](tables/{name}.tex)\n"
+            yield f"{_links('tables', name, 'CSV', 'LaTeX')}\n"
     yield "## Definitions\n"
-    yield DEFINITIONS
+    yield "\n".join(f"- **{name}**: {words}" for name, words in DEFINITIONS) + "\n"
     yield "## What is missing\n"
-    yield "\n".join(f"- {gap}" for gap in gaps) + "\n" if gaps else "Nothing: every planned run is finished.\n"
+    yield "\n".join(f"- {gap}" for gap in report.gaps) + "\n" if report.gaps else f"{COMPLETE}\n"
     yield "## Runs behind the numbers\n"
     yield f"{_origin(results)}\n"
-    yield made["runs"].markdown()
+    yield report.tables["runs"].markdown()
+
+
+def _links(folder: str, name: str, first: str, second: str) -> str:
+    kinds = {"PDF": "pdf", "numbers": "csv", "CSV": "csv", "LaTeX": "tex"}
+    return ", ".join(f"[{word}]({folder}/{name}.{kinds[word]})" for word in (first, second))
+
+
+def _content(report: Report, pictures: Path) -> Mapping[str, Any]:
+    """What the page shows, by the names of its template."""
+    results = report.results
+    runs = report.tables["runs"]
+    return {
+        "title": report.title,
+        "lead": report.lead,
+        "tally": page.verdicts(report.claims),
+        "gaps": [gap.replace("`", "") for gap in report.gaps],
+        "claims": [page.card(claim) for claim in report.claims],
+        "sections": _sections(report, pictures),
+        "definitions": DEFINITIONS,
+        "mixed": results.runs["fingerprint"].dropna().astype(str).replace("", None).nunique() > 1,
+        "provenance": page.provenance(results),
+        "runs": page.grid("runs", runs),
+        "ids": [f"run-{run}" if first else "" for run, first in _first_seen(runs)],
+        "foot": f"Built from the exported tables of profile {results.profile}; the same tables give the same page.",
+    }
+
+
+def _first_seen(runs: Table) -> Iterator[tuple[str, bool]]:
+    """Run ids in the order of the table, and whether it is the first row of that run: it may stand in two studies."""
+    seen: set[str] = set()
+    for run in runs.numbers["run"].astype(str):
+        yield run, run not in seen
+        seen.add(run)
+
+
+def _sections(report: Report, pictures: Path) -> list[page.Section]:
+    """The method and its tasks first, then a part per study, then what belongs to none."""
+    studies = report.results.studies
+    of_table = {name: study for study in studies for name in report.tables if name.endswith(f"_{study}")}
+    of_table |= {name: "ablation" for name in ("table_2",) if name in report.tables}
+    whole = [_section(report, pictures, "method", "The method and its tasks", "", ("table_1",))]
+    whole += [
+        _section(report, pictures, f"study-{study.replace('@', '-')}", _heading(report.results, study), study, names)
+        for study in studies
+        for names in [tuple(name for name, owner in of_table.items() if owner == study)]
+    ]
+    rest = tuple(name for name in report.tables if name not in of_table and name not in ("table_1", "runs"))
+    whole.append(_section(report, pictures, "scale", "Scripted policies, bounds, Theorem 1", "-", rest))
+    return [section for section in whole if section.plates or section.grids]
+
+
+def _section(report: Report, pictures: Path, name: str, title: str, study: str, names: Sequence[str]) -> page.Section:
+    mine = [picture for picture in report.pictures if picture.study == study]
+    made = rules.command(study, report.results.profile) if study in report.results.studies else DRAWN
+    plates = [page.plate(picture, pictures, made.partition(" && ")[0]) for picture in mine]
+    grids = [page.grid(key, report.tables[key]) for key in names if key in report.tables]
+    return page.Section(name, title, plates, grids)
+
+
+def _heading(results: Results, study: str) -> str:
+    done, plan = int((results.plan(study)["status"] == "finished").sum()), len(results.plan(study))
+    return f"Study {study}" + ("" if done == plan else f" ({done} of {plan} runs finished)")
+
+
+def _alone(results: Results) -> Results:
+    """Without the yardsticks, which are no runs of a study."""
+    return Results(results.points, results.runs[results.runs["study"].isin(results.studies)], results.profile)
+
+
+def _question(results: Results, study: str) -> str:
+    return str(results.plan(study)["question"].iloc[0])
+
+
+def _lead(results: Results) -> str:
+    """How much is behind the report, in a sentence or two."""
+    runs = results.runs[results.runs["study"].isin(results.studies)]
+    done, budgets = int((runs["status"] == "finished").sum()), [results.budget(study) for study in results.studies]
+    known = sorted({budget for budget in budgets if budget})
+    span = f", {' to '.join(dict.fromkeys((steps(known[0]), steps(known[-1]))))} steps each" if known else ""
+    count = len(results.studies)
+    return (
+        f"{done} of {len(runs)} planned runs finished in {count} {'study' if count == 1 else 'studies'}{span}. Every "
+        "number comes from logged runs; what is not there is missing, never zero."
+    )
 
 
 def _summary(results: Results) -> str:
@@ -205,11 +353,6 @@ def _plain(claim: Claim) -> dict[str, object]:
         for name, x in claim.ours.items()
     }
     return claim._asdict() | {"ours": ours, "provisional": claim.provisional}
-
-
-def _caption(name: str, spec: Curves) -> str:
-    """ "Fig. 7. Title" for the paper's figures, the title alone for others."""
-    return f"{name.replace('fig_', 'Fig. ')}. {spec.title}" if name.startswith("fig_") else spec.title
 
 
 def _replace(new: Path, old: Path) -> None:

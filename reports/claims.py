@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from reports.frame import ERRORS, FINAL, THEOREM, Results
+from reports.frame import ERRORS, FINAL, THEOREM, YARDSTICKS, Results
 from reports.paper import Paper
 from reports.stats import FEW, Interval, change, difference, interval
 from reports.tables import NONE, Table, estimate, joined, number, percent, steps
@@ -30,6 +30,8 @@ SIZE = 10.0  # percentage points within which a loss is of the stated size
 CONVERGED = 0.95  # share of the final level from which a curve does not fall again
 REACHED = 0.9  # share of its own final value that counts as reached
 LAST = 0.1  # share of the points of a curve that make its final level
+
+SCALING = "scaling"  # the study of numbers of sensors
 
 Values = NDArray[np.float64]
 
@@ -47,7 +49,10 @@ class Finding(NamedTuple):
 
 
 class Claim(NamedTuple):
-    """A claim with its verdict. `caveats`: why a verdict is provisional; `runs`: the ids behind it."""
+    """A claim with its verdict.
+
+    `caveats`: why a verdict is provisional; `runs`: the ids behind it; `commands`: what makes the numbers again.
+    """
 
     id: str
     text: str
@@ -59,6 +64,7 @@ class Claim(NamedTuple):
     caveats: tuple[str, ...]
     runs: tuple[str, ...]
     rule: str
+    commands: tuple[str, ...] = ()
 
     @property
     def provisional(self) -> bool:
@@ -78,6 +84,7 @@ class Evidence:
     results: Results
     paper: Paper
     used: set[tuple[str, str]] = field(default_factory=set)
+    asked: set[str] = field(default_factory=set)  # studies that the rule looked for, there or not
 
     def stated(self, claim: str) -> Mapping[str, float]:
         """The numbers of a claim."""
@@ -85,6 +92,7 @@ class Evidence:
 
     def finals(self, study: str, arm: str) -> Values:
         """Final returns of an arm's seeds. Raises `UntestableError` with fewer than two."""
+        self.asked.add(study)
         values = self.results.finals(study, arm)
         if len(values) < 2:
             planned, done = len(self.results.plan(study, arm)), ("no", "one")[len(values)]
@@ -114,6 +122,7 @@ class Evidence:
 
     def budget(self, study: str) -> int:
         """Environment steps per run. Raises `UntestableError` if unknown."""
+        self.asked.add(study)
         found = self.results.budget(study)
         if found is None:
             raise UntestableError(f"Study {study} has no runs.")
@@ -121,6 +130,7 @@ class Evidence:
 
     def bound(self, policy: str) -> Interval | None:
         """A scripted policy on the task of the coverage studies: mean and twice its standard error, if it was run."""
+        self.asked.add(YARDSTICKS)
         for table in map(self.results.yardsticks_of, ("coverage", "ablation")):
             if policy in table.index and FINAL in table:
                 value = float(table[FINAL][policy])
@@ -215,25 +225,24 @@ def c6(see: Evidence) -> Finding:
 def c7(see: Evidence) -> Finding:
     """By number of sensors, in study `scaling`: RHMC is above every other method at each number (best), and its mean
     never falls by more than 5 points when sensors are added (stable). reproduced: both. partly: one. not reproduced:
-    neither. untestable: the study has no runs."""
-    study = "scaling"
-    groups = see.results.by_agents(study)
+    neither. untestable: the study has no runs, or RHMC or every other method has none at some number."""
+    see.asked.add(SCALING)
+    groups = see.results.by_agents(SCALING)
     if len(groups) < 2:
-        raise UntestableError("Study scaling has no results for several numbers of sensors.")
-    best, means = [], []
-    for arms in groups.values():
-        ours = see.finals(study, arms["rhmc"]) if "rhmc" in arms else None
-        others = [arm for kind, arm in arms.items() if kind != "rhmc"]
-        if ours is None or not others:
-            raise UntestableError("Study scaling lacks RHMC or every other method at some number of sensors.")
-        best += [difference(ours, see.finals(study, arm)).above(0) for arm in others]
-        means.append(interval(ours))
-    stable = bool(np.all(np.diff([x.value for x in means]) >= -NEAR))
-    reason = (
-        f"Above the other method in {sum(best)} of {len(best)} comparisons; {'stable' if stable else 'not stable'}."
+        raise UntestableError(f"Study {SCALING} has no results for several numbers of sensors.")
+    best, means = [], {}
+    for count, arms in groups.items():
+        others = see.present(SCALING, (arm for method, arm in arms.items() if method != "RHMC"))
+        if "RHMC" not in arms or not others:
+            raise UntestableError(f"Study {SCALING} lacks RHMC or every other method with {count} sensors.")
+        ours = see.finals(SCALING, arms["RHMC"])
+        best += [difference(ours, see.finals(SCALING, arm)).above(0) for arm in others]
+        means[f"RHMC, {count} sensors"] = interval(ours)
+    stable = bool(np.all(np.diff([x.value for x in means.values()]) >= -NEAR))
+    words = "stable" if stable else "not stable"
+    return Finding(
+        _share([all(best), stable]), f"Above another method in {sum(best)} of {len(best)} comparisons; {words}.", means
     )
-    found = {f"RHMC, {count} sensors": x for count, x in zip(groups, means, strict=True)}
-    return Finding(_share([all(best), stable]), reason, found)
 
 
 def c8(see: Evidence) -> Finding:
@@ -305,16 +314,20 @@ def c12(see: Evidence) -> Finding:
 
 def c13(see: Evidence) -> Finding:
     """reproduced: Algorithm 1 reaches the optimum on every random instance tried. not reproduced: it does not on
-    some. untestable: no instances were tried."""
-    rows = see.results.points[see.results.points["study"] == THEOREM]
-    table = rows.pivot_table(index="arm", columns="metric", values="value", aggfunc="sum")
-    if not {"theorem/instances", "theorem/lost"} <= set(table):
+    some. untestable: no instances were tried. Shown by size (agents x options x targets), over all densities."""
+    see.asked.add(THEOREM)
+    table = see.results.theorem
+    if table.empty:
         raise UntestableError("No instances of Algorithm 1 against the optimum were exported.")
-    share = 100 * table["theorem/lost"] / table["theorem/instances"]
-    ours = {f"{arm}: % lost": Interval(float(x), np.nan, np.nan, 1) for arm, x in share.items()}
-    if not table["theorem/lost"].any():
-        return Finding("reproduced", f"No loss in {table['theorem/instances'].sum():.0f} instances.", ours)
-    reason = f"Below the optimum in {share.min():.1f} % to {share.max():.1f} % of random instances."
+    sizes = table.groupby(table.index.str.split(",").str[0])[["instances", "lost"]].sum()
+    ours = {f"{size}: % lost": _flat(100 * row["lost"] / row["instances"]) for size, row in sizes.iterrows()}
+    if not table["lost"].any():
+        return Finding("reproduced", f"No loss in {table['instances'].sum():,.0f} instances.", ours)
+    share = 100 * table["lost"] / table["instances"]
+    reason = (
+        f"Below the optimum in {share.min():.1f} % to {share.max():.1f} % of random instances, by size and density, "
+        f"and by up to {table['max_gap'].max():.2f} of reward."
+    )
     return Finding("not reproduced", reason, ours)
 
 
@@ -350,6 +363,7 @@ def table(claims: Sequence[Claim]) -> Table:
             "caveats": "; ".join(claim.caveats),
             "rule": claim.rule,
             "runs": " ".join(claim.runs),
+            "commands": "; ".join(claim.commands),
         }
         for claim in claims
     )
@@ -371,7 +385,24 @@ def table(claims: Sequence[Claim]) -> Table:
 
 def describe(ours: Mapping[str, Interval]) -> str:
     """The quantities behind a verdict in one line: `full − no filter 2.4 [0.4, 4.4]; ...`."""
-    return "; ".join(f"{name} {estimate(x, _show(name))}" for name, x in ours.items())
+    return "; ".join(f"{name} {value}" for name, value in described(ours))
+
+
+def described(ours: Mapping[str, Interval]) -> list[tuple[str, str]]:
+    """The quantities behind a verdict: names, and values with their intervals."""
+    return [(name, estimate(x, _show(name))) for name, x in ours.items()]
+
+
+def command(study: str, profile: str) -> str:
+    """What makes a study's numbers, and the report from them, again. The study is named as its table is."""
+    report = f"rhmc report --profile {profile}"
+    if study == THEOREM:
+        return f"rhmc theorem --out reports/{profile}/runs && {report}"
+    if study == YARDSTICKS:
+        return f"rhmc yardsticks coverage --profile {profile} --out reports/{profile}/runs && {report}"
+    file, _, variant = study.partition("@")
+    which = f"studies/{file}.yaml --profile {profile}" + (f" --variant {variant}" if variant else "")
+    return f"rhmc study run {which} && rhmc export {which} && {report}"
 
 
 def _judge(name: str, rule: Rule, results: Results, paper: Paper) -> Claim:
@@ -384,9 +415,8 @@ def _judge(name: str, rule: Rule, results: Results, paper: Paper) -> Claim:
     behind = tuple(str(run) for plan in plans for run in plan["run"])
     text = " ".join(cleandoc(rule.__doc__ or "").split())
     caveats = tuple(_caveats(see)) if found.verdict in JUDGED else ()
-    return Claim(
-        name, said.text, said.value, said.place, found.verdict, found.reason, found.ours, caveats, behind, text
-    )
+    about = (name, said.text, said.value, said.place, found.verdict, found.reason, found.ours, caveats, behind, text)
+    return Claim(*about, tuple(command(study, results.profile) for study in sorted(see.asked)))
 
 
 def _caveats(see: Evidence) -> list[str]:
@@ -431,6 +461,11 @@ def _ablation(see: Evidence, claim: str, arm: str) -> Finding:
     alike = abs(loss.value - theirs) <= SIZE or loss.holds(theirs)
     words = "The loss is there and of that size" if alike else "The loss is there, and of another size"
     return Finding("reproduced" if alike else "partly", f"{words}: {numbers}.", ours)
+
+
+def _flat(value: float) -> Interval:
+    """A number without an interval."""
+    return Interval(float(value), np.nan, np.nan, 1)
 
 
 def _count(parts: Mapping[str, tuple[Interval, bool]], what: str) -> Finding:

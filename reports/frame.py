@@ -5,6 +5,7 @@ planned run). What is wrong in them is an error of one line per fault; what is n
 """
 
 import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,6 +15,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+
+from reports.drawn import Build, Scenes, read_modules, read_scenes
+from reports.stats import curve
 
 POINTS = ("study", "arm", "seed", "run", "step", "metric", "value")
 RUNS = (
@@ -31,6 +35,7 @@ RUNS = (
     "question",
     "seconds",
 )
+TOLD = ("machine", "versions")  # of a run, where they are exported
 METHOD = ("kind", "name", "source", "family", "training", "execution", "critic", "coordination")
 STATUSES = ("finished", "partial", "missing")
 METHODS = "methods.json"  # what the methods are
@@ -70,12 +75,16 @@ class Results:
         runs: columns `RUNS`; one row per planned run.
         profile: the profile that made them.
         methods: one record per method: `METHOD` as texts, `actions`, and `parameters` per task and encoder.
+        modules: the networks of Figures 1 to 3, one build per encoder.
+        scenes: what Figures 4, 5 and 8 show.
     """
 
     points: pd.DataFrame
     runs: pd.DataFrame
     profile: str
     methods: Sequence[Mapping[str, Any]] = ()
+    modules: Sequence[Build] = ()
+    scenes: Scenes | None = None
 
     @property
     def studies(self) -> list[str]:
@@ -109,6 +118,12 @@ class Results:
         rows = rows[rows["arm"] == arm].sort_values(["seed", "step"])
         return rows[["seed", "step", "value"]].reset_index(drop=True)
 
+    def mean_curve(self, study: str, arm: str, metric: str = CURVE) -> pd.DataFrame:
+        """Mean over seeds of `curve` with its interval, by step: columns as `stats.curve`, no rows without points."""
+        if (study, arm, metric) not in self._curves:
+            self._curves[study, arm, metric] = curve(self.curve(study, arm, metric))
+        return self._curves[study, arm, metric]
+
     def budget(self, study: str) -> int | None:
         """Environment steps per run as configured, the largest where arms differ; None without runs."""
         return self._trainer(study, "steps")
@@ -122,14 +137,39 @@ class Results:
         texts = self.plan(study)["config"]
         return dict(_config(texts.iloc[0]).get("env", {})) if len(texts) else {}
 
+    def configs(self, study: str) -> dict[str, dict[str, Any]]:
+        """Resolved configuration of each arm's first run, in the order of `arms`."""
+        first = self.plan(study).drop_duplicates("arm").set_index("arm")["config"]
+        return {arm: _config(str(first[arm])) for arm in self.arms(study)}
+
     def by_agents(self, study: str) -> dict[int, dict[str, str]]:
-        """Arms of a study by number of agents, then by kind of algorithm, as their configurations say."""
+        """Arms of a study by number of agents, then by method, as their configurations say.
+
+        A method is named by what is left of its arms' names without the number of agents (`RHMC` of `RHMC, agents=4`
+        and `RHMC, 4 sensors`), so that two arms of one kind of algorithm are two methods.
+        """
         out: dict[int, dict[str, str]] = {}
-        for row in self.plan(study).itertuples():
-            agents = _config(str(row.config)).get("env", {}).get("agents")
+        for arm, config in self.configs(study).items():
+            agents = config.get("env", {}).get("agents")
             if agents is not None:
-                out.setdefault(int(agents), {})[str(row.algorithm)] = str(row.arm)
+                out.setdefault(int(agents), {})[without_count(arm, int(agents))] = arm
         return dict(sorted(out.items()))
+
+    def kind(self, study: str, arm: str) -> str:
+        """Kind of an arm's algorithm as its runs say."""
+        return str(self.plan(study, arm)["algorithm"].iloc[0])
+
+    @cached_property
+    def theorem(self) -> pd.DataFrame:
+        """Algorithm 1 against the optimum: a row per family of instances, columns instances, lost, ...; or no rows."""
+        rows = self.points[self.points["study"] == THEOREM]
+        table = rows.pivot_table(index="arm", columns="metric", values="value", aggfunc="sum")
+        table.columns = pd.Index([str(name).removeprefix("theorem/") for name in table.columns])
+        return table if {"instances", "lost"} <= set(table) else table.iloc[:0]
+
+    def task(self, study: str) -> str:
+        """Kind of a study's task; empty if the study is not there."""
+        return str(self.env(study).get("kind", ""))
 
     @cached_property
     def yardsticks(self) -> list[tuple[dict[str, Any], pd.DataFrame]]:
@@ -147,11 +187,11 @@ class Results:
 
     def yardsticks_of(self, study: str) -> pd.DataFrame:
         """Scripted policies on a study's task, however agents observe it; empty if none were run."""
-        env = self.env(study)
-        for task, table in self.yardsticks:
-            if env and same_task(env, task):
-                return table
-        return pd.DataFrame()
+        return self.yardsticks_on(self.env(study))
+
+    def yardsticks_on(self, env: Mapping[str, Any]) -> pd.DataFrame:
+        """The same for a task's configuration."""
+        return next((table for task, table in self.yardsticks if env and same_task(env, task)), pd.DataFrame())
 
     def gaps(self, expected: Mapping[str, Sequence[str]]) -> list[str]:
         """What is not there, in sentences.
@@ -183,6 +223,10 @@ class Results:
         found = [_config(text).get("trainer", {}).get(name) for text in self.plan(study)["config"]]
         return max((int(x) for x in found if x is not None), default=None)
 
+    @cached_property
+    def _curves(self) -> dict[tuple[str, str, str], pd.DataFrame]:
+        return {}
+
     def _select(self, study: str, metric: str) -> pd.DataFrame:
         return self._metrics.get((study, metric), self.points.iloc[:0])
 
@@ -191,15 +235,22 @@ class Results:
         return {(str(key[0]), str(key[1])): rows for key, rows in self.points.groupby(["study", "metric"])}
 
 
-def load(folder: Path, profile: str) -> Results:
-    """Read and check every table of a folder.
+def load(folder: Path, profile: str, only: str | None = None) -> Results:
+    """Read and check the tables of a folder.
+
+    Args:
+        folder: where exports are.
+        profile: that made them.
+        only: one study, read with the yardsticks and nothing else; None for all.
 
     Raises:
-        TableError: the folder holds no tables, or they are faulty.
+        TableError: the folder holds no tables, or not those of the study, or they are faulty.
     """
     files = sorted(folder.glob("*.parquet"))
     if not files:
         raise TableError(f"{folder}: no tables here; `rhmc export` writes them")
+    if only is not None:
+        files = _only(files, only, folder)
     faults: list[str] = []
     points: list[pd.DataFrame] = []
     runs: list[pd.DataFrame] = []
@@ -213,19 +264,34 @@ def load(folder: Path, profile: str) -> Results:
             faults.append(f"{name}.parquet: {name}.runs.parquet (the planned runs) is not beside it")
         if name.endswith(".runs") and name.removesuffix(".runs") not in names:
             faults.append(f"{name}.parquet: {name.removesuffix('.runs')}.parquet (the points) is not beside it")
-    methods = _methods(folder / METHODS, faults)
+    drawn = (_methods(folder / METHODS, faults), read_modules(folder, faults), read_scenes(folder, faults))
     if not faults:
-        results = Results(_join(points, POINTS), _join(runs, RUNS), profile, methods)
+        results = Results(_join(points, POINTS), _join(runs, RUNS), profile, *(drawn if only is None else ()))
         faults = [*_plan_faults(results), *_point_faults(results)]
         if not faults:
             return results
     raise TableError("\n".join(faults))
 
 
+def without_count(arm: str, agents: int) -> str:
+    """An arm's name without the number of agents: a part `agents=4`, `4 sensors` or `n = 4` between commas."""
+    counted = re.compile(rf"(\w+(\.\w+)*\s*=\s*{agents}|{agents}\s+(sensors?|agents?))")
+    return ", ".join(part for part in arm.split(", ") if not counted.fullmatch(part)) or arm
+
+
 def same_task(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
     """Whether two configurations are one task: how it is observed does not count, nor what only one writes out."""
     shared = (a.keys() & b.keys()) - {"observation"}
     return "kind" in shared and all(a[key] == b[key] for key in shared)
+
+
+def _only(files: Sequence[Path], study: str, folder: Path) -> list[Path]:
+    """Those of a study and of the yardsticks."""
+    names = sorted({name for path in files if (name := path.name.split(".")[0]) not in (YARDSTICKS, THEOREM)})
+    if study not in names:
+        near = f"there are {', '.join(names)}" if names else "there is none"
+        raise TableError(f"{folder}: no table of study {study!r} here ({near}); `rhmc export` writes it")
+    return [path for path in files if path.name.split(".")[0] in (study, YARDSTICKS)]
 
 
 def _read(path: Path, columns: Sequence[str], faults: list[str]) -> pd.DataFrame:
@@ -240,7 +306,8 @@ def _read(path: Path, columns: Sequence[str], faults: list[str]) -> pd.DataFrame
     for column in ("seed", "step", "value", "seconds"):
         if column in table and column in columns and len(table) and not pd.api.types.is_numeric_dtype(table[column]):
             faults.append(f"{path.name}: column {column!r} holds {table[column].dtype}, not numbers")
-    return table.reindex(columns=list(columns))
+    told = [column for column in TOLD if columns == RUNS and column in table]
+    return table.reindex(columns=[*columns, *told])
 
 
 def _methods(path: Path, faults: list[str]) -> list[dict[str, Any]]:

@@ -22,7 +22,8 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy.stats import mannwhitneyu, norm, t, trim_mean
+from scipy.optimize import brentq
+from scipy.stats import mannwhitneyu, norm, t, trim_mean, ttest_ind
 
 SEED = 20_240
 RESAMPLES = 40_000  # the cut tails of few seeds are thin
@@ -104,10 +105,53 @@ def change(x: Values, reference: Values) -> Interval:
 
 
 def improvement(x: Values, y: Values) -> Interval:
-    """Probability that a random seed of x beats one of y, ties counting half: Mann-Whitney's U / (n m)."""
+    """Probability that a random seed of x beats one of y, ties counting half: Mann-Whitney's U / (n m).
+
+    The interval is Newcombe's score interval (2006, "Confidence intervals for an effect size measure based on the
+    Mann-Whitney statistic. Part 2", method 5, 10.1002/sim.2324), no bootstrap: where every seed of x beats every seed
+    of y, each resample says 1, and a bootstrap would claim certainty. Three seeds against three that win all nine
+    comparisons give 0.50 to 1; fewer cannot exclude a coin.
+    """
     x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
-    value = float(mannwhitneyu(x, y).statistic) / (len(x) * len(y))
-    return contrast(_wins, x, y)._replace(value=value)
+    n, m = len(x), len(y)
+    value = float(mannwhitneyu(x, y).statistic) / (n * m)
+    if min(n, m) < 2:
+        return Interval(value, np.nan, np.nan, min(n, m))
+    return Interval(value, _score_bound(value, n, m, 0.0), _score_bound(value, n, m, 1.0), min(n, m))
+
+
+def welch(x: Values, y: Values) -> float:
+    """Two-sided p of Welch's test that two samples have one mean; NaN below two values or without any spread."""
+    if min(len(x), len(y)) < 2 or (np.ptp(x) == 0 and np.ptp(y) == 0):
+        return float("nan")
+    return float(ttest_ind(x, y, equal_var=False).pvalue)
+
+
+def holm(p: Values) -> Values:
+    """p values corrected for how many they are (Holm 1979): below 0.05 together at most once in twenty families.
+
+    Args:
+        p: (k,); NaN (no test) is not counted and stays.
+    """
+    p = np.asarray(p, dtype=np.float64)
+    out = p.copy()
+    tested = np.flatnonzero(~np.isnan(p))
+    order = tested[np.argsort(p[tested], kind="stable")]
+    factors = np.arange(len(order), 0, -1)
+    out[order] = np.minimum(1.0, np.maximum.accumulate(factors * p[order])) if len(order) else p[order]
+    return out
+
+
+def area(steps: Values, values: Values) -> float:
+    """Mean height of a curve: its area over its width, by trapezoids. steps, values: (k,), k >= 1, steps rising."""
+    width = float(steps[-1] - steps[0])
+    return float(np.trapezoid(values, steps) / width) if width > 0 else float(values[-1])
+
+
+def first_at(steps: Values, values: Values, level: float) -> float:
+    """First step at which a curve is at or above a level; NaN if it never is."""
+    reached = np.flatnonzero(np.asarray(values) >= level)
+    return float(steps[reached[0]]) if len(reached) else float("nan")
 
 
 def contrast(function: Contrast, x: Values, y: Values) -> Interval:
@@ -135,9 +179,18 @@ def curve(points: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["step", "mean", "low", "high", "n"])
 
 
-def _wins(x: Values, y: Values) -> Values:
-    gap = x[..., :, None] - y[..., None, :]
-    return np.asarray(((np.sign(gap) + 1) / 2).mean((-2, -1)))
+def _score_bound(value: float, n: int, m: int, end: float) -> float:
+    """Where the score interval of U / (n m) ends towards `end`, 0 or 1."""
+    if abs(value - end) < 1e-12:
+        return end
+    z, half = float(norm.ppf((1 + LEVEL) / 2)), (n + m) / 2 - 1
+
+    def excess(p: float) -> float:
+        variance = p * (1 - p) * (1 + half * ((1 - p) / (2 - p) + p / (1 + p))) / (n * m)
+        return (value - p) ** 2 - z**2 * variance
+
+    inner = value + (end - value) * 1e-9  # at value = 0 or 1 itself both sides are 0
+    return float(brentq(excess, end, inner))
 
 
 def _resample(x: Values, stream: int = 0) -> Values:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from reports.frame import FINAL, METHOD, Results
 from reports.paper import Paper
-from reports.stats import LEVEL, Interval, change, curve, improvement, interval, iqm
+from reports.stats import LEVEL, Interval, change, improvement, interval, iqm
 
 NONE = "–"  # where there is nothing to show
 
@@ -132,7 +132,7 @@ def steadiness(results: Results, study: str) -> Table:
         points = results.curve(study, arm)
         if not len(points):
             continue
-        rows = curve(points)
+        rows = results.mean_curve(study, arm)
         rows = rows[rows["n"] == rows["n"].max()]
         quarter = rows[rows["step"] >= rows["step"].iloc[-1] / 4].iloc[0]
         best, last = rows.loc[rows["mean"].idxmax()], rows.iloc[-1]
@@ -168,6 +168,28 @@ def yardsticks(results: Results) -> Table:
             cells = {_title(name): _with_error(row[name], row.get(f"{name}_sem", np.nan)) for name in names}
             shown.append({"Task": describe_task(task), "Policy": readable(str(row["arm"]))} | cells)
     return Table("Scripted policies and bounds", pd.DataFrame(numbers), pd.DataFrame(shown).fillna(NONE))
+
+
+def theorem(results: Results) -> Table | None:
+    """How often Algorithm 1 falls short, by size and density; None if it was not tried."""
+    table = results.theorem.reset_index()
+    if table.empty:
+        return None
+    numbers = table.assign(share=100 * table["lost"] / table["instances"])
+    shown = pd.DataFrame(
+        {
+            "Instances (agents x options x targets)": numbers["arm"],
+            "Tried": [f"{x:,.0f}" for x in numbers["instances"]],
+            "Below the optimum": [f"{x:.2f} %" for x in numbers["share"]],
+        }
+        | {
+            words: [number(x, 2) for x in numbers[name]]
+            for name, words in (("mean_gap", "Mean gap there"), ("max_gap", "Largest gap"))
+            if name in numbers
+        }
+    )
+    note = "Random instances: each option completes, and each pair is assigned, with the probability in the name."
+    return Table("Theorem 1: Algorithm 1 against the optimum", numbers, shown, note)
 
 
 def runs(results: Results) -> Table:

@@ -25,7 +25,7 @@ ALLOWED = {
     },
     "reports": {
         *("reports", "numpy", "pandas", "scipy", "matplotlib", "cycler", "pyarrow", "pydantic", "ruamel", "jinja2"),
-        "tabulate",
+        *("markupsafe", "tabulate"),
     },
 }
 VERBS = ("common", "doctor", "evaluate", "render", "science", "search", "study", "ui", "yardsticks")
@@ -271,13 +271,14 @@ def test_a_stage_depends_on_what_its_studies_include(stages: dict) -> None:
 
 
 def test_the_report_depends_on_all_its_modules(stages: dict) -> None:
-    parts = {p.relative_to(ROOT).as_posix() for p in (ROOT / "reports").glob("*") if p.suffix in {".py", ".yaml"}}
+    found = [p for p in (ROOT / "reports").glob("*") if p.suffix in {".py", ".yaml", ".j2"}]
+    parts = {p.relative_to(ROOT).as_posix() for p in found}
     listed = {d for d in stages["report"]["deps"] if "${" not in d}
     assert unmatched("dvc.yaml", parts - {"reports/__init__.py"}, listed) == []
 
 
 def test_every_stage_that_computes_waits_for_the_fingerprint(stages: dict) -> None:
-    for stage in (stages["study"]["do"], stages["yardsticks"], stages["theorem"], stages["methods"]):
+    for stage in (stages["study"]["do"], *(stages[name] for name in ("yardsticks", "theorem", "methods", "drawings"))):
         assert ".fingerprint" in stage["deps"]
     assert ".fingerprint" in stages["fingerprint"]["outs"][0]
 

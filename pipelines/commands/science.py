@@ -59,15 +59,33 @@ def fingerprint(file: Annotated[Path | None, typer.Argument(help="Write it there
         raise InputError(f"{file}: cannot be written ({error.strerror})") from error
 
 
+def drawings(
+    out: Annotated[Path, typer.Option(help="Folder; made if it is not there.")] = Path("reports/quick/runs"),
+) -> None:
+    """Write what Figures 1 to 5 and 8 show: RHMC's networks as they run, and states of both tasks."""
+    from pipelines.drawings import export_drawings
+
+    with folder_option(out):
+        for file in export_drawings(out):
+            print(f"wrote {file}", file=sys.stderr)
+
+
 def report(
     profile: Profile = "quick",
+    study: Annotated[Path | None, typer.Option(metavar="FILE", help="Report on this study alone.")] = None,
+    variant: Annotated[str | None, typer.Option(help="Of that study.")] = None,
     runs: Annotated[Path | None, typer.Option(help="Exported tables; reports/<profile>/runs if not given.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder; reports/<profile> if not given.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder; reports/<profile>[/study/<name>] if not given.")] = None,
 ) -> None:
-    """Build figures, tables and claims from the exported tables."""
+    """Build figures, tables, claims and their page from the exported tables; or curves and comparison of one study."""
+    if study is not None and not study.is_file():
+        raise InputError(f"--study: {study} is not a file; a study such as studies/ablation.yaml")
+    if variant is not None and study is None:
+        raise InputError("--variant: belongs to a study; give --study as well")
     from reports.build import main as build
 
     arguments = ["--profile", profile]
+    arguments += ["--study", f"{study.stem}@{variant}" if variant else study.stem] if study else []
     arguments += ["--runs", str(runs)] if runs else []
     arguments += ["--out", str(out)] if out else []
     raise typer.Exit(build(arguments))

@@ -121,3 +121,74 @@ def write(folder: Path, *tables: Tables) -> Path:
 def noisy(mean: float, n: int = 3, spread: float = 1.0) -> list[float]:
     """n values of that mean, evenly spread over mean - spread .. mean + spread."""
     return [float(x) for x in np.linspace(mean - spread, mean + spread, n)]
+
+
+def drawings(folder: Path) -> Path:
+    """What `rhmc drawings --out` writes, small: a chain and a branched network per role, two states, one instance."""
+    folder.mkdir(parents=True, exist_ok=True)
+    builds = [
+        {
+            "encoder": encoder,
+            "task": COVERAGE,
+            "settings": {"filter": "on", "regulator": "paper", "horizon": 1, "alpha": 0.1, "assignment_period": 1},
+            "networks": [_network(f"{level} {part}") for level in ("coordinator", "executor") for part in PARTS],
+        }
+        for encoder in ("mlp", "pairwise")
+    ]
+    (folder / "modules.json").write_text(json.dumps(builds))
+    (folder / "scenes.json").write_text(json.dumps(SCENES))
+    return folder
+
+
+PARTS = ("actor", "critic")
+SCENES: dict[str, Any] = {
+    "navigation": {
+        "policy": "matching",
+        "positions": [[[0, 0], [0.5, 0.5]], [[0.1, 0], [0.5, 0.2]]],
+        "landmarks": [[0.2, 0], [0.5, 0]],
+        "radius": 0.15,
+        "near": 0.1,
+    },
+    "coverage": [
+        {
+            "agents": n,
+            "policy": "best_window",
+            "step": 20,
+            "sensors": [[100 * i, 0] for i in range(n)],
+            "heading": [90.0] * n,
+            "targets": [[0, 300], [0, -300]],
+            "seen": [[True, False]] * n,
+            "range": 800.0,
+            "half_view": 45.0,
+            "half_area": 1250.0,
+        }
+        for n in (2, 3)
+    ],
+    "regulation": {
+        "alpha": 0.1,
+        "horizon": 6,
+        "assignment": [[1, 1], [1, 0]],
+        "options": [[[1, 0], [0, 1]], [[1, 0]]],
+        "paths": {
+            "algorithm_1": {"choices": [0, 0], "completed": [True, False], "reward": 0.4},
+            "optimum": {"choices": [1, 0], "completed": [True, True], "reward": 1.5},
+        },
+        "met": [{"horizon": 6, "states": 1000, "lost": 7, "max_gap": 1.1}],
+    },
+}
+
+
+def _network(role: str) -> dict[str, Any]:
+    layers = [("a", 3, 4), ("b", 4, 2), ("c", 4, 2), ("d", 2, 1)]
+    edges = [("x", "a"), ("a", "a.relu"), ("a.relu", "b"), ("a.relu", "c"), ("b", "d"), ("c", "d"), ("d", "output")]
+    every = [{"name": name, "kind": "Linear", "in": i, "out": o, "parameters": i * o + o} for name, i, o in layers]
+    relu = {"name": "a.relu", "kind": "ReLU", "in": 4, "out": 4, "parameters": 0}
+    return {
+        "role": role,
+        "kind": "Toy",
+        "parameters": sum(layer["parameters"] for layer in every),
+        "inputs": [{"name": "x", "shape": [2, 3]}],
+        "output": [2, 1],
+        "layers": [every[0], relu, *every[1:]],
+        "edges": [{"from": a, "to": b, "through": ["sum"] if b == "d" else []} for a, b in edges],
+    }

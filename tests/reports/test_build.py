@@ -59,8 +59,12 @@ def test_every_file_is_there(made: Path) -> None:
     names = ("table_1", "table_2", "final_ablation", "final_coverage", "final_navigation", "yardsticks", "runs")
     assert {f"tables/{name}.{kind}" for name in names for kind in ("md", "csv", "tex")} < found
     assert {"claims.md", "claims.csv", "claims.json", "index.md"} < found
-    assert {f"tables/steadiness_{study}.md" for study in ("ablation", "coverage", "navigation")} < found
-    assert len(found) == 9 + 30 + 4
+    studies = ("ablation", "coverage", "navigation")
+    for kind in ("steadiness", "pairs"):
+        assert {f"tables/{kind}_{study}.md" for study in studies} < found
+    assert {"tables/efficiency_ablation.md", "tables/efficiency_coverage.md", "tables/theorem.md"} < found
+    assert {"figures/better_ablation.png"} | {f"figures/profile_{study}.png" for study in studies} < found
+    assert "index.html" in found
 
 
 def test_the_same_bytes_in_another_process_with_other_settings(runs: Path, made: Path, tmp_path: Path) -> None:
@@ -69,7 +73,7 @@ def test_the_same_bytes_in_another_process_with_other_settings(runs: Path, made:
     env = os.environ | {"PYTHONHASHSEED": "7", "MATPLOTLIBRC": str(tmp_path), "TZ": "Asia/Tokyo"}
     call = [sys.executable, "-m", "reports.build", "--runs", str(runs), "--out", str(out)]
     said = subprocess.run(call, cwd=ROOT, env=env, check=True, capture_output=True, text=True).stdout
-    assert said == f"43 files; start with {out / 'index.md'}\n"
+    assert said == f"{len(content(out))} files; start with {out / 'index.html'}\n"
     first, second = content(made), content(out)
     assert [name for name in first if first[name] != second.get(name)] == []
 
@@ -77,7 +81,7 @@ def test_the_same_bytes_in_another_process_with_other_settings(runs: Path, made:
 def test_index(made: Path) -> None:
     text = (made / "index.md").read_text()
     parts = [
-        "## Learning curves",
+        "## Figures",
         "## The paper's claims",
         "## Table 1",
         "## Table 2",
@@ -88,7 +92,7 @@ def test_index(made: Path) -> None:
     assert [text.index(part) for part in parts] == sorted(text.index(part) for part in parts)
     assert "no such arm yet: HiT-MAC, QMIX, COMA, MAPPO, MADDPG" in text
     assert "code fingerprint `0123456789ab`, commit `c0ffee`" in text
-    assert "mean over seeds of `final/return`" in text
+    assert "mean over seeds of final/return" in text
     linked = [part.split(")")[0] for part in text.split("](")[1:]]
     assert [link for link in linked if not link.startswith("#") and not (made / link).exists()] == []
 
@@ -99,6 +103,10 @@ def test_claims_as_json(made: Path) -> None:
     assert found["C8"]["verdict"] == "partly"
     assert found["C8"]["provisional"] is True
     assert found["C8"]["ours"]["full"]["value"] == pytest.approx(71.0)
+    assert found["C8"]["commands"] == [
+        "rhmc study run studies/ablation.yaml --profile quick && rhmc export studies/ablation.yaml --profile quick && "
+        "rhmc report --profile quick"
+    ]
     assert found["C13"]["ours"]["4 x 3 x 5: % lost"] == {"value": 4.0, "low": None, "high": None, "n": 1}
 
 
@@ -260,7 +268,7 @@ def test_spread_leaves_alone_what_is_apart() -> None:
 def test_a_study_that_is_not_there(tmp_path: Path) -> None:
     out = tmp_path / "out"
     build(write(tmp_path / "runs", study("coverage", {"RHMC": noisy(67), "IQL": noisy(63)})), out, "quick")
-    assert sorted(path.name for path in (out / "figures").glob("*.png")) == ["fig_7.png"]
+    assert sorted(path.name for path in (out / "figures").glob("*.png")) == ["fig_7.png", "profile_coverage.png"]
     text = (out / "index.md").read_text()
     assert "Study `ablation`: no results." in text
     assert "## Table 2" not in text

@@ -1,0 +1,167 @@
+"""Every figure of a report with its words: title, caption that says what to see, text for those who cannot see it."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from reports import comparison, diagrams, figures, scaling, scenes
+from reports.canvas import Drawing
+from reports.frame import FINAL, Results
+from reports.paper import Curves, Paper
+from reports.tables import describe_task, joined, number
+
+PAPERS = "fig_"
+
+
+class Picture(NamedTuple):
+    """A figure of the report; `name` is that of its files."""
+
+    name: str
+    title: str
+    caption: str
+    alt: str
+    drawing: Drawing
+    study: str = ""
+
+    @property
+    def heading(self) -> str:
+        """`Fig. 7. Title` for the paper's figures, the title alone for others."""
+        own = self.name.removeprefix(PAPERS)
+        return f"Fig. {own}. {self.title}" if self.name.startswith(PAPERS) and own.isdigit() else self.title
+
+
+def gallery(results: Results, paper: Paper) -> list[Picture]:
+    """The paper's figures in their order, then what goes beyond it. What has no data is left out."""
+    drawn = [*_networks(results), *_states(results), *_scaling(results)]
+    known = {spec.study: name for name, spec in paper.figures.items()}
+    for study in results.studies:
+        spec = paper.figures[known[study]] if study in known else paper.curves_of(study, results.task(study))
+        drawn += _curves(results, spec, known.get(study, f"curves_{study}"))
+    own = sorted((p for p in drawn if p.name.startswith(PAPERS)), key=lambda p: _order(p.name))
+    return own + [p for p in drawn if not p.name.startswith(PAPERS)] + list(beyond(results))
+
+
+def study_gallery(results: Results, paper: Paper, study: str) -> list[Picture]:
+    """The figures of one study."""
+    spec = paper.curves_of(study, results.task(study))
+    return [*_curves(results, spec, f"curves_{study}"), *_sweep(results, study, f"scaling_{study}"), *beyond(results)]
+
+
+def beyond(results: Results) -> Iterator[Picture]:
+    """What the paper does not have: performance profiles and probabilities of improvement."""
+    for study in results.studies:
+        arms = comparison.compared(results, study)
+        profile = comparison.profile(results, study)
+        if profile:
+            title = f"Performance profile, study {study}"
+            caption = "See which line stays furthest right: that arm's seeds end highest, whatever score one asks for."
+            yield Picture(f"profile_{study}", title, caption, f"Step chart for {joined(arms)}.", profile, study)
+        matrix = comparison.matrix(results, study)
+        if matrix:
+            title = f"Probability of improvement, study {study}"
+            caption = f"Rows are sorted by mean: the bluer the row, the more often it wins. On top: {arms[0]}."
+            alt = f"Matrix of the probability that a seed of one arm beats one of another, for {joined(arms)}."
+            yield Picture(f"better_{study}", title, caption, alt, matrix, study)
+
+
+def curve_caption(results: Results, study: str) -> str:
+    """What to see in the curves of a study, from its numbers."""
+    arms = comparison.compared(results, study)
+    waiting = [arm for arm in results.arms(study) if not len(results.finals(study, arm))]
+    words = f" No finished run yet: {joined(waiting)}." if waiting else ""
+    if not arms:
+        return f"No arm has two finished seeds yet.{words}"
+    means = {arm: float(results.finals(study, arm).mean()) for arm in arms}
+    first = f"{arms[0]} ends highest, at {number(means[arms[0]])}"
+    second = f"; next is {arms[1]} at {number(means[arms[1]])}" if len(arms) > 1 else ""
+    return f"See the order at the right edge: {first}{second}.{_against_scripts(results, study, means)}{words}"
+
+
+def _against_scripts(results: Results, study: str, means: dict[str, float]) -> str:
+    level = comparison.reference(results, study)
+    if level is None or FINAL not in results.yardsticks_of(study):
+        return ""
+    over = [arm for arm, mean in means.items() if mean > level.value]
+    count = "None" if not over else "All" if len(over) == len(means) else f"{len(over)} of {len(means)} arms"
+    return f" {count} end{'s' if len(over) == 1 or not over else ''} above {number(level.value)}, {level.words}."
+
+
+def _curves(results: Results, spec: Curves, name: str) -> Iterator[Picture]:
+    whole = figures.learning_curves(results, spec)
+    if whole is None:
+        return
+    finals = [
+        f"{arm} {number(float(x.mean()))}"
+        for arm in results.arms(spec.study)
+        if len(x := results.finals(spec.study, arm))
+    ]
+    alt = f"Line chart of return against environment steps, {describe_task(results.env(spec.study))}. "
+    alt += f"Final returns: {', '.join(finals)}." if finals else "No run is finished."
+    yield Picture(name, spec.title, curve_caption(results, spec.study), alt, whole, spec.study)
+    each = figures.each_arm(results, spec)
+    if each:
+        caption = "The same curves one by one: see the width of each band, and where a curve bends down again."
+        yield Picture(
+            f"{name}_arms", f"{spec.title}, arm by arm", caption, f"Small line charts. {alt}", each, spec.study
+        )
+
+
+def _networks(results: Results) -> Iterator[Picture]:
+    if not results.modules:
+        return
+    builds = results.modules
+    sizes = "; ".join(f"{n.role}, {b.encoder}: {n.parameters:,}" for b in builds for n in b.networks)
+    alt = f"Diagram of RHMC's networks. Parameters: {sizes}."
+    caption = "Two levels and what runs between them: see how small the networks are, and that the critics see more."
+    yield Picture("fig_1", "Architecture of RHMC", caption, alt, diagrams.architecture(builds))
+    for name, role, level in (("fig_2", "coordinator", "High"), ("fig_3", "executor", "Low")):
+        title = f"{level} level: the {role}{'s' if role == 'executor' else ''}, layer by layer"
+        caption = (
+            "Every layer as it ran: the fully connected reading above, the pairwise one below, which pools over pairs."
+        )
+        yield Picture(
+            name, title, caption, f"Diagram of the {role}'s layers. {alt}", diagrams.level(builds, role, title)
+        )
+
+
+def _states(results: Results) -> Iterator[Picture]:
+    found = results.scenes
+    if found is None:
+        return
+    ours, best = found.regulation.paths.algorithm_1.reward, found.regulation.paths.optimum.reward
+    caption = (
+        f"A column is an agent, a box one of its options. Algorithm 1 settles on {number(ours, 2)} (orange) where "
+        f"{number(best, 2)} was to be had (blue): it keeps one set of targets per option, chosen by count."
+    )
+    alt = f"Graph of options by agent with two paths: Algorithm 1, reward {number(ours, 2)}; optimum {number(best, 2)}."
+    yield Picture(
+        "fig_4", "Regulation: Algorithm 1 on a real instance", caption, alt, scenes.regulation(found.regulation)
+    )
+    caption = "An episode's first and last state. The task is done when every cross lies under an agent of its own."
+    alt = "Two plots of agents and landmarks in the plane, before and after an episode."
+    yield Picture("fig_5", "Cooperative navigation", caption, alt, scenes.navigation(found.navigation))
+    seen = ", ".join(f"{scenes.covered(s)} of {len(s.targets)} with {s.agents}" for s in found.coverage)
+    caption = "Five targets and more and more sensors: see how sectors overlap, so that a sensor more adds ever less."
+    alt = f"Plots of sensors with their sectors of view and targets. Targets seen: {seen} sensors."
+    yield Picture(
+        "fig_8", "Sensor coverage with different numbers of sensors", caption, alt, scenes.coverage(found.coverage)
+    )
+
+
+def _scaling(results: Results) -> Iterator[Picture]:
+    yield from _sweep(results, scaling.STUDY, "fig_9")
+
+
+def _sweep(results: Results, study: str, name: str) -> Iterator[Picture]:
+    found = scaling.sweep(results, study)
+    drawing = scaling.figure(results, found) if found else None
+    if found and drawing:
+        caption = (
+            "See whether one line stays on top at every number of agents, and whether it ever falls as they are added."
+        )
+        alt = f"Line chart of final return against {joined(map(str, found.counts))} agents for {joined(found.arms)}."
+        yield Picture(name, "Final return by number of agents", caption, alt, drawing, study)
+
+
+def _order(name: str) -> tuple[int, str]:
+    digits = name.removeprefix(PAPERS).partition("_")[0]
+    return (int(digits) if digits.isdigit() else 99, name)

@@ -1,0 +1,144 @@
+"""The report as one page of HTML that needs nothing else: figures inside, no network, the same bytes every time."""
+
+import re
+from base64 import b64encode
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup, escape
+
+from reports.claims import JUDGED, VERDICTS, Claim, described
+from reports.frame import TOLD, Results
+from reports.gallery import Picture
+from reports.tables import NONE, Table
+
+TEMPLATE = "page.html.j2"
+NUMBER = re.compile(r"^[+<\s]*(-?\d[\d,]*(?:\.\d+)?)\s*([kM]?)\b")
+UNITS = {"": 1.0, "k": 1e3, "M": 1e6}
+MARKS: Mapping[str, str] = {  # a sign for each verdict, beside its colour
+    "reproduced": "✓",
+    "partly": "◐",
+    "not reproduced": "✗",
+    "untestable": "?",
+    "contradicted by the paper itself": "⚡",
+}
+
+
+class Cell(NamedTuple):
+    """A cell's words and what it is sorted by."""
+
+    text: Markup
+    key: str
+
+
+class Grid(NamedTuple):
+    """A table as the page shows it. `files`: stem of its CSV and LaTeX, or nothing."""
+
+    id: str
+    title: str
+    note: str
+    columns: list[str]
+    rows: list[list[Cell]]
+    files: str
+
+
+class Plate(NamedTuple):
+    """A figure as the page shows it."""
+
+    name: str
+    heading: str
+    caption: str
+    alt: str
+    data: str
+    width: int
+    height: int
+    behind: str
+
+
+class Section(NamedTuple):
+    """A part of the page."""
+
+    id: str
+    title: str
+    plates: list[Plate]
+    grids: list[Grid]
+
+
+def render(content: Mapping[str, Any]) -> str:
+    """The page. content: see `page.html.j2`; a name that is missing there is an error."""
+    folder = FileSystemLoader(Path(__file__).parent)
+    env = Environment(loader=folder, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    return env.get_template(TEMPLATE).render(content)
+
+
+def plate(picture: Picture, folder: Path, behind: str) -> Plate:
+    """A figure from its PNG in a folder. behind: the command that made its numbers."""
+    data = (folder / f"{picture.name}.png").read_bytes()
+    width, height = int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")  # of the PNG's header
+    text = b64encode(data).decode()
+    return Plate(picture.name, picture.heading, picture.caption, picture.alt, text, width, height, behind)
+
+
+def grid(name: str, table: Table, *, files: bool = True) -> Grid:
+    """A table, every cell with what it is sorted by."""
+    columns = [str(column) for column in table.shown.columns]
+    rows = [[cell(str(text)) for text in row] for row in table.shown.to_numpy(str)]
+    return Grid(f"table-{name}", table.title, table.note, columns, rows, f"tables/{name}" if files else "")
+
+
+def cell(text: str) -> Cell:
+    """Words with `<br>` kept and all else escaped; sorted as a number if they begin with one, and empty last."""
+    words = Markup("<br>").join(escape(part) for part in text.split("<br>"))
+    return Cell(words, sort_key(text))
+
+
+def sort_key(text: str) -> str:
+    """What a cell is sorted by: its leading number in full, or its words; nothing where there is nothing to show."""
+    if text in (NONE, "", "missing", "nan"):
+        return ""
+    found = NUMBER.match(text.replace("−", "-"))
+    if not found:
+        return text.casefold()
+    return f"{float(found[1].replace(',', '')) * UNITS[found[2]]:.10g}"
+
+
+def verdicts(claims: Sequence[Claim]) -> list[dict[str, Any]]:
+    """How many claims got each verdict, and how many of them are provisional."""
+    found = []
+    for verdict in VERDICTS:
+        mine = [claim for claim in claims if claim.verdict == verdict]
+        if mine:
+            provisional = sum(claim.provisional for claim in mine)
+            found.append({"verdict": verdict, "mark": MARKS[verdict], "count": len(mine), "provisional": provisional})
+    return found
+
+
+def card(claim: Claim) -> dict[str, Any]:
+    """A claim as the page shows it."""
+    ours = [{"name": name, "value": value} for name, value in described(claim.ours)]
+    shown = {"ours": ours, "mark": MARKS[claim.verdict], "kind": claim.verdict.split()[0]}
+    return claim._asdict() | shown | {"provisional": claim.provisional, "judged": claim.verdict in JUDGED}
+
+
+def provenance(results: Results) -> list[tuple[str, str]]:
+    """What made the runs: names and values."""
+    runs = results.runs
+    known = {name: sorted(set(runs[name].dropna().astype(str)) - {""}) for name in ("fingerprint", "commit")}
+    seconds = float(runs["seconds"].fillna(0).sum())
+    found = [("Profile", results.profile)]
+    found += [("Code fingerprint", ", ".join(known["fingerprint"]) or "unknown")]
+    found += [("Commit", ", ".join(known["commit"]) or "unknown")]
+    for name in TOLD:
+        values = sorted(set(runs[name].dropna().astype(str)) - {""}) if name in runs else []
+        found.append((name.capitalize(), "; ".join(values) or "not exported"))
+    return [*found, ("Processor time of all runs", duration(seconds))]
+
+
+def duration(seconds: float) -> str:
+    """`3 h 12 min`, `45 s`."""
+    minutes = round(seconds / 60)
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{minutes // 60} h {minutes % 60} min" if minutes >= 60 else f"{minutes} min"
