@@ -45,6 +45,7 @@ BATCH = 1000  # values that one request may carry
 PARENT = "study"  # tag `role` of the parent run; its runs have `run`
 PATIENCE = 20.0  # seconds that a reader waits for a writer of SQLite, as MLflow's own do
 NOTE = "mlflow.note.content"  # the tag that MLflow shows as a description
+COLOUR = "mlflow.runColor"  # the tag that MLflow takes a run's colour from
 
 
 def tracking_uri(home: Home) -> str:
@@ -107,12 +108,16 @@ class MlflowTracker:
         ref = self._only("tags.role = 'study'", self.study.study, {"role": PARENT}).info.run_id
         assert self.experiment is not None
         self._describe(ref, self.study.note)
-        save_views(self.client, self.client.get_experiment(self.experiment), self.study.params)
+        experiment = self.client.get_experiment(self.experiment)
+        save_views(self.client, experiment, views.views(self.study.params, self.study.arms))
         self.client.update_run(ref, "RUNNING")
         return ref
 
     def _describe(self, ref: str, note: str) -> None:
+        """Show the note, with the saved views in its first paragraph: all that MLflow shows of it unasked."""
         assert self.experiment is not None
+        first, gap, rest = note.partition("\n\n")
+        note = f"{first} {views.links(self.experiment)}{gap}{rest}"
         self.client.set_experiment_tag(self.experiment, NOTE, note)
         self.client.set_tag(ref, NOTE, note)
 
@@ -188,7 +193,9 @@ class MlflowTracker:
         return MlflowRun(self, card, ref, seen)
 
     def _tags(self, card: Card) -> dict[str, str]:
-        return {
+        arms = list(self.study.arms)
+        colour = {COLOUR: views.COLOURS[arms.index(card.arm) % len(views.COLOURS)]} if card.arm in arms else {}
+        return colour | {
             "role": "run",
             "mlflow.parentRunId": self.parent or "",
             "variant": card.arm,
@@ -337,21 +344,25 @@ def addresses(uri: str, server: str) -> list[tuple[str, str, str]]:
 
 
 def _views_of(client: MlflowClient, experiment: Experiment) -> list[views.View]:
-    there = views.views([])
+    there = views.views({})
     if all(view.tag in experiment.tags for view in there):
         return there
     runs = client.search_runs([experiment.experiment_id], "tags.role = 'run'", max_results=100)
-    return save_views(client, experiment, list(dict.fromkeys(name for run in runs for name in run.data.params)))
+    params: dict[str, list[str]] = defaultdict(list)
+    for run in runs:
+        mine = params[run.data.params.get("method", "")]
+        mine += [name for name in run.data.params if name not in (*mine, "method")]
+    wanted = views.views(params, dict.fromkeys(run.data.tags.get("variant", "") for run in runs))
+    save_views(client, experiment, wanted)
+    return wanted
 
 
-def save_views(client: MlflowClient, experiment: Experiment, params: Sequence[str]) -> list[views.View]:
-    """Write the saved views of an experiment whose runs differ in `params`, where they are not as they should be."""
-    wanted = views.views(params)
+def save_views(client: MlflowClient, experiment: Experiment, wanted: Sequence[views.View]) -> None:
+    """Write the saved views of an experiment where they are not as they should be."""
     for view in wanted:
         written = view.written(experiment.creation_time or 0)
         if experiment.tags.get(view.tag) != written:
             client.set_experiment_tag(experiment.experiment_id, view.tag, written)
-    return wanted
 
 
 def fetch(ref: str, wanted: Sequence[str], home: Home, folder: Path) -> list[str]:

@@ -2,7 +2,7 @@
 
 import json
 import subprocess
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from io import StringIO
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -72,14 +72,20 @@ def study_card(study: Study) -> StudyCard:
     arms = list(dict.fromkeys(run.arm for run in runs))
     seeds = sorted({run.spec.seed for run in runs})
     steps = sorted({run.spec.trainer.steps for run in runs})
-    params = [name for name in what_varies([run.spec for run in runs]) if name not in (KIND, "seed")]
     budget = ", ".join(f"{count:,}" for count in steps)
     note = (
         f"{study.question}\n\n"
         f"Profile `{study.profile}`: {len(arms)} arms × {len(seeds)} seeds, {budget} environment steps each.\n\n"
         + "\n".join(f"- **{arm}**: {_differs(study, arm)}" for arm in arms)
     )
-    return StudyCard(study.name, study.profile, note, ("method", *params, "seed"))
+    return StudyCard(study.name, study.profile, note, _varying([run.spec for run in runs]), arms)
+
+
+def _varying(specs: Sequence[RunSpec]) -> dict[str, list[str]]:
+    """What varies between runs, as far as the runs of each method have it."""
+    names = [name for name in what_varies(specs) if name != KIND]
+    flats = {spec.algo.kind: flatten(spec.model_dump(mode="json")) for spec in specs}
+    return {method: [name for name in names if name in flat] for method, flat in flats.items()}
 
 
 def _differs(study: Study, arm: str) -> str:

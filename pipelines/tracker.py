@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
+from types import MappingProxyType
 from typing import Literal, NamedTuple, Protocol
 
 from rhmc.types import Metrics
@@ -21,7 +22,8 @@ class StudyCard(NamedTuple):
     study: str
     profile: str
     note: str  # Markdown: question, arms, seeds, budget
-    params: tuple[str, ...] = ()  # names of what varies between its runs, and method and seed
+    params: Mapping[str, Sequence[str]] = MappingProxyType({})  # what varies, by method (arm of a search)
+    arms: Sequence[str] = ()
 
 
 class Card(NamedTuple):

@@ -7,7 +7,8 @@ and documented nowhere: it belongs to the MLflow that is pinned, and a new pin n
 import base64
 import json
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import islice
 from typing import Any, NamedTuple
 
 from pipelines.names import HEADLINES
@@ -16,9 +17,29 @@ TAG = "mlflow.sharedViewState."
 RUNS = "tags.role = 'run'"  # the parent run has no curves
 BY_ARM = {"aggregateFunction": "average", "groupByKeys": [{"mode": "tag", "groupByData": "variant"}]}
 FINALS = ("final/return", "final/coverage", "final/landmarks_covered", "final/collisions")
-CURVES, ENDS = "The headlines", "final"
-FOLDED = ("eval", "train", "time", "Model metrics", "System metrics")  # sections of what no chart of ours shows
+CURVES, ENDS, EVERY = "Curves", "Final values", "Every run"
+FOLDED = (
+    "eval",
+    "final",
+    "train",
+    "time",
+    "Model metrics",
+    "System metrics",
+)  # MLflow's own: what no chart of ours shows
+NAME, BEGUN, DURATION, MODELS = (
+    "attributes.`Run Name`",
+    "runDateAndNestInfo",
+    "duration",
+    "attributes.`Models`",
+)  # columns
+LINE_HEIGHT, PARALLEL_HEIGHT, WIDTH = 320, 420, 130  # pixels: of charts, of a column
+COLOURS = (  # of the runs of each arm, as in the study's figure; MLflow itself picks those of groups
+    *("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd"),
+    *("#8c564b", "#e377c2", "#7f7f7f", "#bcbd22", "#17becf"),
+)
+SHOWN = 100  # runs, and so arms, of a page
 
+Params = Mapping[str, Sequence[str]]  # what varies, by kind of run: by method, or by arm of a search
 State = dict[str, Any]
 
 
@@ -47,24 +68,39 @@ class View(NamedTuple):
         return json.dumps(envelope)
 
 
-def views(params: Sequence[str]) -> list[View]:
-    """The views of a study whose runs differ in `params`."""
+def views(params: Params, arms: Iterable[str] = ()) -> list[View]:
+    """The views of a study.
+
+    Args:
+        params: what varies between its runs.
+        arms: its arms, which the table shows as a line each.
+    """
+    grouped = _base(params) | {"groupBy": BY_ARM}
+    folded = {"groupsExpanded": {f"tag.variant.{arm}": False for arm in islice(arms, SHOWN)}}
     return [
-        View("rhmc-curves", "Curves by arm", "CHART", _base(params) | {"groupBy": BY_ARM} | _curves()),
-        View("rhmc-finals", "Finals by arm", "TABLE", _base(params) | {"groupBy": BY_ARM}),
+        View("rhmc-curves", "Curves by arm", "CHART", grouped | folded | _curves()),
+        View("rhmc-finals", "Finals by arm", "TABLE", grouped | folded),
         View("rhmc-parallel", "Every run", "CHART", _base(params) | _parallel(params)),
     ]
 
 
-def _base(params: Sequence[str]) -> State:
+def links(experiment: str) -> str:
+    """The views of an experiment as Markdown for its description, whatever the server's address is."""
+    return " · ".join(f"[{view.name}](#/experiments/{experiment}/runs?{view.query})" for view in views({}))
+
+
+def _base(params: Params) -> State:
     """All runs of the study, the best first."""
+    columns = _columns(_names(params))
     return {
         "searchFilter": RUNS,
         "orderByKey": _column("metrics", "final/return"),
         "orderByAsc": False,
         "startTime": "ALL",
         "lifecycleFilter": "Active",
-        "selectedColumns": _columns(params),
+        "selectedColumns": columns,
+        "columnOrder": [NAME, BEGUN, *columns[:-1], DURATION, MODELS],
+        "columnWidths": {BEGUN: 120} | {name: WIDTH for name in columns[:-1]},
         "runsHiddenMode": "SHOW_ALL",
         "useGroupedValuesInCharts": True,
         "hideEmptyCharts": True,
@@ -73,39 +109,60 @@ def _base(params: Sequence[str]) -> State:
     }
 
 
+def _names(params: Params) -> list[str]:
+    """What varies in any kind of run."""
+    return list(dict.fromkeys(name for names in params.values() for name in names))
+
+
 def _column(kind: str, name: str) -> str:
     return f"{kind}.`{name}`"
 
 
-def _columns(params: Sequence[str]) -> list[str]:
-    metrics = [_column("metrics", name) for name in (*FINALS, *HEADLINES)]
-    varying = [_column("params", name) for name in params if name != "seed"]
-    return [*metrics, _column("params", "seed"), *varying, _column("attributes", "Models")]
+def _columns(names: Sequence[str]) -> list[str]:
+    """Final values, what varies, the speed; the models last."""
+    finals = [_column("metrics", name) for name in FINALS]
+    varying = [_column("params", name) for name in ("method", *names) if name != "seed"]  # which a run's name says
+    return [*finals, *varying, _column("metrics", "steps_per_second"), MODELS]
 
 
 def _curves() -> State:
     lines = [_chart("LINE", CURVES, name, displayPoints=False) for name in HEADLINES]
     bars = [_chart("BAR", ENDS, name) for name in FINALS]
-    return {"compareRunSections": _sections(CURVES, ENDS), "compareRunCharts": lines + bars}
+    sections = [_section(CURVES, cardHeight=LINE_HEIGHT), _section(ENDS, cardHeight=LINE_HEIGHT), *_folded()]
+    return {"compareRunSections": sections, "compareRunCharts": lines + bars}
 
 
-def _parallel(params: Sequence[str]) -> State:
-    axes = {"selectedParams": list(params), "selectedMetrics": ["final/return"], "showAllRuns": True}
-    chart = _chart("PARALLEL", ENDS, "every run") | axes
-    return {"compareRunSections": _sections(ENDS, CURVES), "compareRunCharts": [chart, *_curves()["compareRunCharts"]]}
+def _parallel(params: Params) -> State:
+    """A chart of what all runs have, and one for each kind with more: MLflow leaves out runs that lack an axis."""
+    common = [name for name in _names(params) if all(name in own for own in params.values())]
+    axes = {EVERY: ["method", *common]}
+    axes |= {f"{EVERY} of {kind}": list(own) for kind, own in params.items() if not set(own) <= {*common}}
+    charts = [_chart("PARALLEL", name, name) | _axes(chosen) for name, chosen in axes.items()]
+    wide = [_section(name, columns=1, cardHeight=PARALLEL_HEIGHT) for name in axes]
+    rest = _curves()
+    return {
+        "compareRunSections": [*wide, *rest["compareRunSections"]],
+        "compareRunCharts": [*charts, *rest["compareRunCharts"]],
+    }
+
+
+def _axes(params: Sequence[str]) -> State:
+    return {"selectedParams": list(params), "selectedMetrics": ["final/return"], "showAllRuns": True}
 
 
 def _chart(kind: str, section: str, metric: str, **more: Any) -> State:
     """A card. Metrics without one get one from MLflow, in the section of their group."""
     fixed = {"type": kind, "uuid": f"rhmc-{kind}-{metric}", "metricSectionId": _section_id(section)}
-    return fixed | {"metricKey": metric, "runsCountToCompare": 100, "deleted": False, "isGenerated": False} | more
+    return fixed | {"metricKey": metric, "runsCountToCompare": SHOWN, "deleted": False, "isGenerated": False} | more
 
 
-def _sections(*shown: str) -> list[State]:
-    return [
-        {"uuid": _section_id(name), "name": name, "display": name in shown, "isReordered": False, "deleted": False}
-        for name in (*shown, *FOLDED)
-    ]
+def _section(name: str, **more: int) -> State:
+    fixed = {"uuid": _section_id(name), "name": name, "display": name not in FOLDED}
+    return fixed | {"isReordered": False, "deleted": False} | more
+
+
+def _folded() -> list[State]:
+    return [_section(name) for name in FOLDED]
 
 
 def _section_id(name: str) -> str:
