@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedSeq
 
 from pipelines.study import RunSpec, Study, changes
 from pipelines.tracker import Card, Recorded, StudyCard
@@ -104,8 +105,18 @@ def resolved_yaml(item: Item, study: StudyCard) -> str:
     head = {"study": study.study, "profile": study.profile, "arm": item.card.arm}
     names = {"spec_id": item.card.spec_id, "fingerprint": item.card.fingerprint, "commit": item.card.commit}
     out = StringIO()
-    YAML().dump(head | names | item.spec.model_dump(mode="json"), out)
+    YAML().dump(head | names | _lists_on_a_line(item.spec.model_dump(mode="json")), out)
     return out.getvalue()
+
+
+def _lists_on_a_line(tree: Any) -> Any:
+    if isinstance(tree, dict):
+        return {name: _lists_on_a_line(value) for name, value in tree.items()}
+    if not isinstance(tree, list):
+        return tree
+    line = CommentedSeq(tree)
+    line.fa.set_flow_style()
+    return line
 
 
 def commit() -> str:

@@ -100,7 +100,7 @@ def _base(params: Params) -> State:
         "lifecycleFilter": "Active",
         "selectedColumns": columns,
         "columnOrder": [NAME, BEGUN, *columns[:-1], DURATION, MODELS],
-        "columnWidths": {BEGUN: 120} | {name: WIDTH for name in columns[:-1]},
+        "columnWidths": {BEGUN: 120} | dict.fromkeys(columns[:-1], WIDTH),
         "runsHiddenMode": "SHOW_ALL",
         "useGroupedValuesInCharts": True,
         "hideEmptyCharts": True,

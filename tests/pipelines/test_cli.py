@@ -1,5 +1,6 @@
 """The command: what it prints, what it refuses, and what it does not import."""
 
+import io
 import json
 import os
 import signal
@@ -97,9 +98,9 @@ def test_every_verb_explains_itself(rhmc: Rhmc, words: list[str]) -> None:
 
 def test_help_ends_with_the_exit_codes(rhmc: Rhmc) -> None:
     said = " ".join(rhmc("--help").out.split())
-    assert said.endswith("130 interrupted. Results are kept in $RHMC_HOME, or in the folder work.")
+    assert said.endswith("143 terminated. Results are kept in $RHMC_HOME, or in the folder work.")
     page = (ROOT / "docs/cli.md").read_text()
-    assert all(f"| {code} |" in page for code in (0, 1, 2, 130))
+    assert all(f"| {code} |" in page for code in (0, 1, 2, 130, 143))
 
 
 def test_the_page_of_the_command_line_names_every_verb() -> None:
@@ -427,6 +428,9 @@ class Server:
         assert start_new_session
         Server.given = command, env
 
+    def poll(self) -> None:
+        """It runs."""
+
     def wait(self, timeout: float | None = None) -> int:
         if timeout is None:
             raise KeyboardInterrupt
@@ -451,7 +455,20 @@ def test_ui_serves_the_store_on_this_machine_only_until_ctrl_c(
     monkeypatch.setattr(ui, "subprocess", SimpleNamespace(Popen=Server))
     monkeypatch.setattr(ui.os, "killpg", lambda *given: killed.append(given))
     monkeypatch.setattr(ui.signal, "signal", lambda *given: None)
+    asked = iter([OSError("not yet"), io.BytesIO()])
+
+    def answer(address: str, timeout: float) -> io.BytesIO:
+        assert address == f"http://127.0.0.1:{port}/health"
+        now = next(asked)
+        if isinstance(now, OSError):
+            raise now
+        return now
+
+    monkeypatch.setattr("urllib.request.urlopen", answer)
+    monkeypatch.setattr("pipelines.mlflow_tracker.addresses", lambda *given: [("a", "One", "x"), ("a", "Two", "y")])
     said = rhmc("ui", "--port", str(port))
+    assert list(asked) == []  # it waited for the server
+    assert said.out.endswith(" ends it)\n\na\n  One:            x\n  Two:            y\n")
     assert killed == [(Server.pid, signal.SIGTERM)]
     command, env = Server.given
     assert said.code == 0
@@ -461,6 +478,16 @@ def test_ui_serves_the_store_on_this_machine_only_until_ctrl_c(
     assert (options["--host"], options["--port"], options["--workers"]) == ("127.0.0.1", str(port), "1")
     assert env["MLFLOW_SERVER_ENABLE_JOB_EXECUTION"] == "false"
     assert env["MLFLOW_DISABLE_TELEMETRY"] == "true"
+
+
+def test_ui_tells_no_address_of_a_server_that_ended_at_once(
+    rhmc: Rhmc, store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ended = SimpleNamespace(poll=lambda: 3, wait=lambda: 3)
+    monkeypatch.setattr(ui, "subprocess", SimpleNamespace(Popen=lambda command, **options: ended))
+    monkeypatch.setattr(ui, "_free", lambda port: None)
+    monkeypatch.setattr(ui.signal, "signal", lambda *given: None)
+    assert rhmc("ui") == (1, "", "")
 
 
 def test_sigterm_ends_the_server_and_its_workers(tmp_path: Path) -> None:
