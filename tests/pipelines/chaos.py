@@ -31,6 +31,7 @@ from werkzeug.serving import WSGIRequestHandler, make_server
 
 from pipelines import ray_driver, run
 from pipelines.mlflow_tracker import open_existing
+from pipelines.names import full
 from pipelines.plan import study_card
 from pipelines.recorder import Recorder
 from pipelines.store import Home
@@ -74,7 +75,7 @@ def _run(client: Any, one: Any, home: Path) -> Run:
     history = {}
     for metric in sorted(one.data.metrics):
         values = [
-            (m.step, "" if metric.startswith("time/") else m.value.hex())
+            (m.step, "" if full(metric).startswith("time/") else m.value.hex())
             for m in client.get_metric_history(ref, metric)
         ]
         history[metric] = sorted(values)
