@@ -176,6 +176,14 @@ class MlflowTracker:
             runs = self._search(query, everywhere)
         return {_recorded(run).key: run.info.run_id for run in reversed(runs)}
 
+    def mark(self, ref: str, *, stale: bool) -> None:
+        """See `Tracker`."""
+        with explained(self.uri):
+            if stale:
+                self.client.set_tag(ref, views.STALE, "yes")
+            else:
+                self.client.delete_tag(ref, views.STALE)
+
     def start(self, card: Card) -> "MlflowRun":
         """See `Tracker`."""
         query = f"tags.role = 'run' and tags.spec = '{card.spec_id}' and tags.fingerprint = '{card.fingerprint}'"
@@ -431,7 +439,8 @@ def open_existing(study: StudyCard, home: Home) -> MlflowTracker | None:
 def _recorded(run: Run) -> Recorded:
     tags: dict[str, str] = defaultdict(str, run.data.tags)
     key = f"{tags['spec']}-{tags['fingerprint']}"
-    return Recorded(run.info.run_id, tags["variant"], key, FROM_MLFLOW[run.info.status], tags["commit"])
+    status = FROM_MLFLOW[run.info.status]
+    return Recorded(run.info.run_id, tags["variant"], key, status, tags["commit"], views.STALE in tags)
 
 
 # What may be in the way

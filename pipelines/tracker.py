@@ -58,6 +58,7 @@ class Recorded(NamedTuple):
     key: str
     status: Status
     commit: str
+    stale: bool = False  # marked as no part of the latest plan
 
 
 class Row(NamedTuple):
@@ -109,6 +110,10 @@ class Tracker(Protocol):
 
     def finished_anywhere(self, fingerprint: str) -> dict[str, str]:
         """Key -> ref of a finished run, of whatever study shares the log."""
+        ...
+
+    def mark(self, ref: str, *, stale: bool) -> None:
+        """Say of a run whether the latest plan is without it: then it stays, and views and averages pass over it."""
         ...
 
     def start(self, card: Card) -> RunLog:
@@ -210,7 +215,17 @@ class MemoryTracker:
 
     def recorded(self) -> list[Recorded]:
         """See `Tracker`."""
-        return [Recorded(r.ref, r.card.arm, r.card.key, r.status, r.card.commit) for r in self._mine()]
+        return [
+            Recorded(r.ref, r.card.arm, r.card.key, r.status, r.card.commit, "stale" in r.tags) for r in self._mine()
+        ]
+
+    def mark(self, ref: str, *, stale: bool) -> None:
+        """See `Tracker`."""
+        (run,) = (run for run in self.shelf if run.ref == ref)
+        if stale:
+            run.tags["stale"] = "yes"
+        else:
+            run.tags.pop("stale", None)
 
     def finished_anywhere(self, fingerprint: str) -> dict[str, str]:
         """See `Tracker`."""

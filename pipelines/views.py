@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 from pipelines.names import HEADLINES
 
 TAG = "mlflow.sharedViewState."
-RUNS = "tags.role = 'run'"  # the parent run has no curves
+STALE = "stale"  # the tag of runs that the latest plan of the study is without: other steps, other code
+RUNS = f"tags.role = 'run' and tags.{STALE} IS NULL"  # the parent run has no curves
 BY_ARM = {"aggregateFunction": "average", "groupByKeys": [{"mode": "tag", "groupByData": "variant"}]}
 FINALS = ("final/return", "final/coverage", "final/landmarks_covered", "final/collisions")
 CURVES, ENDS, EVERY = "Curves", "Final values", "Every run"

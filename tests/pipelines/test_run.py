@@ -87,6 +87,21 @@ def test_a_finished_run_is_logged_whole_and_skipped_afterwards(launch: Launch, s
     assert again.skipped == 1
 
 
+def test_what_was_logged_under_another_plan_is_set_aside_until_it_is_planned_again(
+    launch: Launch, shelf: list[MemoryRun]
+) -> None:
+    recorder = launch()
+    for key in [item.key for item in recorder.todo()]:
+        step(recorder, key)
+        finish(recorder, key)
+    launch(plan()[:1])
+    assert [run.tags for run in shelf] == [{}, {"stale": "yes"}]
+    launch(plan()[1:])
+    assert [run.tags for run in shelf] == [{"stale": "yes"}, {}]
+    assert launch().skipped == 2
+    assert [run.tags for run in shelf] == [{}, {}]
+
+
 def test_the_whole_configuration_is_kept(launch: Launch, shelf: list[MemoryRun]) -> None:
     recorder = launch()
     item = recorder.todo()[0]

@@ -191,6 +191,19 @@ def test_a_study_that_was_logged_without_views_gets_them_when_it_is_shown(home: 
     assert finals["groupsExpanded"] == {"tag.variant.full": False}
 
 
+def test_views_pass_over_stale_runs_and_the_parent(home: Path) -> None:
+    tracker = MlflowTracker(STUDY, Home(home))
+    refs = [tracker.start(CARD._replace(spec_id=spec_id)).ref for spec_id in ("1", "2")]
+
+    def shown() -> set[str]:
+        query = views.views({})[0].state["searchFilter"]
+        return {run.info.run_id for run in tracker.client.search_runs([str(tracker.experiment)], query)}
+
+    assert shown() == set(refs)
+    tracker.mark(refs[0], stale=True)
+    assert shown() == {refs[1]}
+
+
 def test_an_experiment_of_somebody_else_is_left_alone(home: Path) -> None:
     tracker = MlflowTracker(STUDY, Home(home))
     theirs = tracker.client.create_experiment("theirs")
