@@ -1,6 +1,7 @@
 """From a plan to a log: the recorder with the twin and no Ray, then the whole chain."""
 
 import io
+import json
 import os
 import signal
 import socket
@@ -21,8 +22,8 @@ from ruamel.yaml import YAML
 from pipelines import progress, ray_driver, run, trainable
 from pipelines.export import export_study
 from pipelines.fingerprint import fingerprint
-from pipelines.mlflow_tracker import open_existing
-from pipelines.plan import Item, study_card, what_varies
+from pipelines.mlflow_tracker import MlflowTracker, open_existing
+from pipelines.plan import Item, items, study_card, what_varies
 from pipelines.progress import LiveBoard, PlainBoard, duration
 from pipelines.ray_driver import _knock, sockets
 from pipelines.recorder import Recorder
@@ -319,6 +320,21 @@ def test_a_terminal_gets_a_line_per_running_run() -> None:
     for part in ("full s0", "500/1,000", "50 steps/s", "return 2.00", "10 s left", "full s1", "starting"):
         assert part in shown
     assert "full s0: finished, return 2.00" in out.getvalue()
+
+
+def test_runs_of_a_killed_driver_are_not_said_to_be_running(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    study = tiny()
+    plan = items(study, fingerprint(), "")
+    MlflowTracker(study_card(study), Home(home)).start(plan[0].card)
+
+    def slow() -> dict[str, int]:
+        assert show_status(study, home, as_json=True) == 1
+        arm: dict[str, int] = json.loads(capsys.readouterr().out)["arms"]["slow"]
+        return arm
+
+    with Home(home).lock(study.name, study.profile):
+        assert (slow()["running"], slow()["interrupted"]) == (1, 0)
+    assert (slow()["running"], slow()["interrupted"]) == (0, 1)
 
 
 # What may be in the way
