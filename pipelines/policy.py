@@ -126,6 +126,8 @@ NO_SPEC = (ValidationError, ValueError, KeyError, TypeError, AttributeError)  # 
 
 
 def _spec(fields: Any) -> RunSpec:
+    if missing := [name for name in RunSpec.model_fields if name not in fields]:
+        raise ValueError(f"{missing[0]}: missing")
     return RunSpec.model_validate({name: fields[name] for name in RunSpec.model_fields})
 
 

@@ -8,7 +8,6 @@ import base64
 import json
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import islice
 from typing import Any, NamedTuple
 
 from pipelines.names import HEADLINES
@@ -33,7 +32,8 @@ NAME, BEGUN, DURATION, MODELS = (
     "duration",
     "attributes.`Models`",
 )  # columns
-LINE_HEIGHT, PARALLEL_HEIGHT, WIDTH = 320, 420, 130  # pixels: of charts, of a column
+LINE_HEIGHT, PARALLEL_HEIGHT = 320, 420  # pixels of a chart
+NARROW, WIDE, LETTER, ROOM = 130, 400, 8, 40  # pixels: of a column, and of its text
 COLOURS = (  # of the runs of each arm, as in the study's figure; MLflow itself picks those of groups
     *("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd"),
     *("#8c564b", "#e377c2", "#7f7f7f", "#bcbd22", "#17becf"),
@@ -76,12 +76,13 @@ def views(params: Params, arms: Iterable[str] = ()) -> list[View]:
         params: what varies between its runs.
         arms: its arms, which the table shows as a line each.
     """
-    grouped = _base(params) | {"groupBy": BY_ARM}
-    folded = {"groupsExpanded": {f"tag.variant.{arm}": False for arm in islice(arms, SHOWN)}}
+    arms = list(arms)[:SHOWN]
+    base = _base(params, arms)
+    grouped = base | {"groupBy": BY_ARM, "groupsExpanded": {f"tag.variant.{arm}": False for arm in arms}}
     return [
-        View("rhmc-curves", "Curves by arm", "CHART", grouped | folded | _curves()),
-        View("rhmc-finals", "Finals by arm", "TABLE", grouped | folded),
-        View("rhmc-parallel", "Every run", "CHART", _base(params) | _parallel(params)),
+        View("rhmc-curves", "Curves by arm", "CHART", grouped | _curves()),
+        View("rhmc-finals", "Finals by arm", "TABLE", grouped),
+        View("rhmc-parallel", "Every run", "CHART", base | _parallel(params)),
     ]
 
 
@@ -90,8 +91,9 @@ def links(experiment: str) -> str:
     return " · ".join(f"[{view.name}](#/experiments/{experiment}/runs?{view.query})" for view in views({}))
 
 
-def _base(params: Params) -> State:
-    """All runs of the study, the best first."""
+def _base(params: Params, arms: Sequence[str]) -> State:
+    """All runs of the study, the best first, in columns that show what they are of."""
+    names = [f"Group: {arm} 10" for arm in arms]
     columns = _columns(_names(params))
     return {
         "searchFilter": RUNS,
@@ -101,7 +103,7 @@ def _base(params: Params) -> State:
         "lifecycleFilter": "Active",
         "selectedColumns": columns,
         "columnOrder": [NAME, BEGUN, *columns[:-1], DURATION, MODELS],
-        "columnWidths": {BEGUN: 120} | dict.fromkeys(columns[:-1], WIDTH),
+        "columnWidths": {NAME: _width(*names), BEGUN: NARROW} | {name: _width(name[9:]) for name in columns[:-1]},
         "runsHiddenMode": "SHOW_ALL",
         "useGroupedValuesInCharts": True,
         "hideEmptyCharts": True,
@@ -126,11 +128,16 @@ def _columns(names: Sequence[str]) -> list[str]:
     return [*finals, *varying, _column("metrics", "steps_per_second"), MODELS]
 
 
+def _width(*texts: str) -> int:
+    """Pixels for the longest of the texts."""
+    return min(WIDE, max([NARROW, *(ROOM + LETTER * len(text) for text in texts)]))
+
+
 def _curves() -> State:
     lines = [_chart("LINE", CURVES, name, displayPoints=False) for name in HEADLINES]
     bars = [_chart("BAR", ENDS, name) for name in FINALS]
-    sections = [_section(CURVES, cardHeight=LINE_HEIGHT), _section(ENDS, cardHeight=LINE_HEIGHT), *_folded()]
-    return {"compareRunSections": sections, "compareRunCharts": lines + bars}
+    shown = [_section(name, columns=2, cardHeight=LINE_HEIGHT) for name in (CURVES, ENDS)]
+    return {"compareRunSections": [*shown, *_folded()], "compareRunCharts": lines + bars}
 
 
 def _parallel(params: Params) -> State:

@@ -17,6 +17,7 @@ from pipelines.commands.common import DONE, UNFINISHED, say
 from pipelines.errors import InputError
 
 HOST = "127.0.0.1"
+LOG = "ui.log"  # in the work folder: what MLflow says of every request
 PATIENCE = 10.0  # seconds for the server to end by itself
 
 
@@ -35,6 +36,7 @@ def ui(port: Annotated[int, typer.Option(min=1, max=65535, help="Where to listen
     from pipelines.mlflow_tracker import check as check_store
 
     try:
+        home.prepare()
         check_store(uri or f"sqlite:///{home.database}")
         saved = addresses(uri or f"sqlite:///{home.database}", f"http://{HOST}:{port}")
     except StoreError as error:
@@ -63,8 +65,12 @@ def _serve(uri: str, artifacts: Path, port: int, saved: Iterable[tuple[str, str,
         raise KeyboardInterrupt
 
     signal.signal(signal.SIGTERM, leave)
-    # A session of its own: the server is several processes, and whatever ends us ends all of them.
-    server = subprocess.Popen(command, env=os.environ | quiet, start_new_session=True)
+    log = artifacts.parent / LOG
+    with log.open("wb") as said:
+        # A session of its own: the server is several processes, and whatever ends us ends all of them.
+        server = subprocess.Popen(
+            command, env=os.environ | quiet, start_new_session=True, stdout=said, stderr=subprocess.STDOUT
+        )
     try:
         if _answers(server, port):
             _tell(port, saved)
@@ -72,6 +78,8 @@ def _serve(uri: str, artifacts: Path, port: int, saved: Iterable[tuple[str, str,
     except KeyboardInterrupt:
         _end(server)
         return
+    if code:
+        print(f"rhmc: MLflow's server ended with exit code {code}; {log} says why", file=sys.stderr)
     raise typer.Exit(UNFINISHED if code else DONE)
 
 

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import pandas as pd
 import pytest
@@ -264,8 +264,11 @@ def test_run_hands_on_the_study_the_work_folder_and_the_exit_code(
 def test_export_goes_to_the_folder_of_the_profile(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[tuple[Any, ...]] = []
     monkeypatch.setattr("pipelines.export.export_study", lambda study, out: calls.append((study.name, out)) or 1)
-    assert rhmc("export", "studies/x.yaml", "--profile", "paper").code == 1
-    assert rhmc("export", "studies/x.yaml", "--out", "there").code == 1
+    report = "next:  rhmc report --study studies/x.yaml"
+    assert rhmc("export", "studies/x.yaml", "--profile", "paper") == (1, "", f"{report} --profile paper\n")
+    assert rhmc("export", "studies/x.yaml", "--out", "there") == (1, "", f"{report} --runs there\n")
+    monkeypatch.setattr("pipelines.export.export_study", lambda study, out: 2)
+    assert rhmc("export", "studies/x.yaml") == (2, "", "")
     assert calls == [("x", Path("reports/paper/runs")), ("x", Path("there"))]
 
 
@@ -424,8 +427,11 @@ class Server:
     given: tuple[list[str], dict[str, str]]
     pid = 4711
 
-    def __init__(self, command: list[str], env: dict[str, str], *, start_new_session: bool) -> None:
+    def __init__(
+        self, command: list[str], env: dict[str, str], *, start_new_session: bool, stdout: IO[bytes], stderr: int
+    ) -> None:
         assert start_new_session
+        stdout.write(b"talk")
         Server.given = command, env
 
     def poll(self) -> None:
@@ -452,7 +458,7 @@ def test_ui_serves_the_store_on_this_machine_only_until_ctrl_c(
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     killed: list[tuple[int, int]] = []
-    monkeypatch.setattr(ui, "subprocess", SimpleNamespace(Popen=Server))
+    monkeypatch.setattr(ui, "subprocess", SimpleNamespace(Popen=Server, STDOUT=-2))
     monkeypatch.setattr(ui.os, "killpg", lambda *given: killed.append(given))
     monkeypatch.setattr(ui.signal, "signal", lambda *given: None)
     asked = iter([OSError("not yet"), io.BytesIO()])
@@ -475,6 +481,7 @@ def test_ui_serves_the_store_on_this_machine_only_until_ctrl_c(
     assert said.out.startswith(f"http://127.0.0.1:{port}/#/experiments?workflowType=machine_learning ")
     options = dict(zip(command[4::2], command[5::2], strict=True))
     assert options["--backend-store-uri"] == f"sqlite:///{store}"
+    assert (store.parent / "ui.log").read_text() == "talk"
     assert (options["--host"], options["--port"], options["--workers"]) == ("127.0.0.1", str(port), "1")
     assert env["MLFLOW_SERVER_ENABLE_JOB_EXECUTION"] == "false"
     assert env["MLFLOW_DISABLE_TELEMETRY"] == "true"
@@ -484,10 +491,11 @@ def test_ui_tells_no_address_of_a_server_that_ended_at_once(
     rhmc: Rhmc, store: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ended = SimpleNamespace(poll=lambda: 3, wait=lambda: 3)
-    monkeypatch.setattr(ui, "subprocess", SimpleNamespace(Popen=lambda command, **options: ended))
+    monkeypatch.setattr(ui, "subprocess", SimpleNamespace(Popen=lambda command, **options: ended, STDOUT=-2))
     monkeypatch.setattr(ui, "_free", lambda port: None)
     monkeypatch.setattr(ui.signal, "signal", lambda *given: None)
-    assert rhmc("ui") == (1, "", "")
+    why = f"rhmc: MLflow's server ended with exit code 3; {store.parent}/ui.log says why\n"
+    assert rhmc("ui") == (1, "", why)
 
 
 def test_sigterm_ends_the_server_and_its_workers(tmp_path: Path) -> None:
@@ -497,7 +505,7 @@ def test_sigterm_ends_the_server_and_its_workers(tmp_path: Path) -> None:
         "real = subprocess.Popen\n"
         f"server = ['sh', '-c', 'sleep 600 & echo $! > {file}.part; mv {file}.part {file}; wait']\n"
         "ui.subprocess.Popen = lambda command, **options: real(server, **options)\n"
-        "ui._serve('sqlite:///x', Path('.'), 1, [])\n"
+        f"ui._serve('sqlite:///x', Path('{tmp_path}/artifacts'), 1, [])\n"
     )
     process = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.DEVNULL)
     while not file.exists():
