@@ -3,6 +3,7 @@
 One experiment per study and profile, in it one parent run for the study and one nested run per arm and key.
 """
 
+import json
 import logging
 import os
 import sqlite3
@@ -19,7 +20,7 @@ from typing import Any, NamedTuple
 
 from filelock import FileLock
 
-from pipelines import names, views
+from pipelines import legend, names, views
 from pipelines.errors import InputError
 from pipelines.store import Home, StoreError, one_line, replace_durably, sync
 from pipelines.tracker import Card, Recorded, Row, Status, StudyCard, unseen
@@ -45,7 +46,8 @@ BATCH = 1000  # values that one request may carry
 PARENT = "study"  # tag `role` of the parent run; its runs have `run`
 PATIENCE = 20.0  # seconds that a reader waits for a writer of SQLite, as MLflow's own do
 NOTE = "mlflow.note.content"  # the tag that MLflow shows as a description
-COLOUR = "mlflow.runColor"  # the tag that MLflow takes a run's colour from
+ARMS = "arms"  # the experiment's tag with its arms as JSON, in the order in which they came: it decides their colours
+COLOURED = 100  # arms that the tag has room for; a view shows no more
 
 
 def tracking_uri(home: Home) -> str:
@@ -80,6 +82,7 @@ class MlflowTracker:
                 create_database(sqlite_file(self.uri))
             self.client = MlflowClient(self.uri, self.uri)
             self.experiment = self._experiment(home, write)
+            self.arms = self._colour_arms() if write else []
             self.parent = self._parent() if write else None
             if write:
                 self._interrupt_running()
@@ -104,12 +107,34 @@ class MlflowTracker:
                 raise
             return found.experiment_id
 
+    def _colour_arms(self) -> list[str]:
+        """The arms that have colours: those that had one keep it, for it is in the names of their runs' groups."""
+        assert self.experiment is not None
+        known: list[str] = json.loads(self.client.get_experiment(self.experiment).tags.get(ARMS, "[]"))
+        arms = [*known, *(arm for arm in self.study.arms if arm not in known)][:COLOURED]
+        if arms != known:
+            self.client.set_experiment_tag(self.experiment, ARMS, json.dumps(arms, ensure_ascii=False))
+        for run in self._search(f"tags.role = 'run' and tags.{legend.TAG} IS NULL"):  # of an earlier version
+            self.client.log_batch(
+                run.info.run_id, tags=[RunTag(*pair) for pair in self._look(_recorded(run).arm, arms)]
+            )
+        return arms
+
+    @staticmethod
+    def _look(arm: str, arms: Sequence[str]) -> list[tuple[str, str]]:
+        """Tags that say how the runs of an arm are shown."""
+        if arm not in arms:
+            return [(legend.TAG, arm)]
+        place = arms.index(arm)
+        return [(legend.TAG, legend.legend(arm, place)), (legend.COLOUR, legend.colour(place))]
+
     def _parent(self) -> str:
         ref = self._only("tags.role = 'study'", self.study.study, {"role": PARENT}).info.run_id
         assert self.experiment is not None
         self._describe(ref, self.study.note)
         experiment = self.client.get_experiment(self.experiment)
-        save_views(self.client, experiment, views.views(self.study.params, self.study.arms))
+        legends = [dict(self._look(arm, self.arms))[legend.TAG] for arm in self.study.arms]
+        save_views(self.client, experiment, views.views(self.study.params, legends))
         self.client.update_run(ref, "RUNNING")
         return ref
 
@@ -201,9 +226,7 @@ class MlflowTracker:
         return MlflowRun(self, card, ref, seen)
 
     def _tags(self, card: Card) -> dict[str, str]:
-        arms = list(self.study.arms)
-        colour = {COLOUR: views.COLOURS[arms.index(card.arm) % len(views.COLOURS)]} if card.arm in arms else {}
-        return colour | {
+        return dict(self._look(card.arm, self.arms)) | {
             "role": "run",
             "mlflow.parentRunId": self.parent or "",
             "variant": card.arm,
@@ -360,7 +383,7 @@ def _views_of(client: MlflowClient, experiment: Experiment) -> list[views.View]:
     for run in runs:
         mine = params[run.data.params.get("method", "")]
         mine += [name for name in run.data.params if name not in (*mine, "method")]
-    wanted = views.views(params, dict.fromkeys(run.data.tags.get("variant", "") for run in runs))
+    wanted = views.views(params)
     save_views(client, experiment, wanted)
     return wanted
 

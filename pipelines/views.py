@@ -7,15 +7,15 @@ and documented nowhere: it belongs to the MLflow that is pinned, and a new pin n
 import base64
 import json
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from pipelines import legend
 from pipelines.names import HEADLINES
 
 TAG = "mlflow.sharedViewState."
 STALE = "stale"  # the tag of runs that the latest plan of the study is without: other steps, other code
 RUNS = f"tags.role = 'run' and tags.{STALE} IS NULL"  # the parent run has no curves
-BY_ARM = {"aggregateFunction": "average", "groupByKeys": [{"mode": "tag", "groupByData": "variant"}]}
 FINALS = ("final/return", "final/coverage", "final/landmarks_covered", "final/collisions")
 CURVES, ENDS, EVERY = "Curves", "Final values", "Every run"
 FOLDED = (
@@ -34,10 +34,6 @@ NAME, BEGUN, DURATION, MODELS = (
 )  # columns
 LINE_HEIGHT, PARALLEL_HEIGHT = 320, 420  # pixels of a chart
 NARROW, WIDE, LETTER, ROOM = 130, 400, 8, 40  # pixels: of a column, and of its text
-COLOURS = (  # of the runs of each arm, as in the study's figure; MLflow itself picks those of groups
-    *("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd"),
-    *("#8c564b", "#e377c2", "#7f7f7f", "#bcbd22", "#17becf"),
-)
 SHOWN = 100  # runs, and so arms, of a page
 
 Params = Mapping[str, Sequence[str]]  # what varies, by kind of run: by method, or by arm of a search
@@ -69,16 +65,19 @@ class View(NamedTuple):
         return json.dumps(envelope)
 
 
-def views(params: Params, arms: Iterable[str] = ()) -> list[View]:
+def views(params: Params, legends: Sequence[str] = ()) -> list[View]:
     """The views of a study.
 
     Args:
         params: what varies between its runs.
-        arms: its arms, which the table shows as a line each.
+        legends: of its arms, which the table shows as a line each. Without them runs are grouped by their arms' names.
     """
-    arms = list(arms)[:SHOWN]
-    base = _base(params, arms)
-    grouped = base | {"groupBy": BY_ARM, "groupsExpanded": {f"tag.variant.{arm}": False for arm in arms}}
+    legends = legends[:SHOWN]
+    base, tag = _base(params, legends), legend.TAG if legends else "variant"
+    grouped = base | {
+        "groupBy": {"aggregateFunction": "average", "groupByKeys": [{"mode": "tag", "groupByData": tag}]},
+        "groupsExpanded": {legend.group(name): False for name in legends},
+    }
     return [
         View("rhmc-curves", "Curves by arm", "CHART", grouped | _curves()),
         View("rhmc-finals", "Finals by arm", "TABLE", grouped),
@@ -91,9 +90,9 @@ def links(experiment: str) -> str:
     return " · ".join(f"[{view.name}](#/experiments/{experiment}/runs?{view.query})" for view in views({}))
 
 
-def _base(params: Params, arms: Sequence[str]) -> State:
+def _base(params: Params, legends: Sequence[str]) -> State:
     """All runs of the study, the best first, in columns that show what they are of."""
-    names = [f"Group: {arm} 10" for arm in arms]
+    names = [f"Group: {name} 10" for name in legends]
     columns = _columns(_names(params))
     return {
         "searchFilter": RUNS,

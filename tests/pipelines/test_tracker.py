@@ -167,7 +167,7 @@ def test_how_a_run_looks_in_mlflow(home: Path) -> None:
         "mlflow.parentRunId": tracker.parent,
     }
     assert run.data.tags.items() >= expected.items()
-    assert parent.data.tags["mlflow.note.content"] == "**Why?**"
+    assert parent.data.tags["mlflow.note.content"].startswith("**Why?** [Curves by arm](#/experiments/")
     assert tracker.client.get_experiment(run.info.experiment_id).tags["mlflow.note.content"] == "**Why?**"
     assert tracker.file(log.ref, "none.pt", home) is None
     (home / "copy").mkdir()

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from pipelines import mlflow_tracker, overview, views
+from pipelines import legend, mlflow_tracker, overview, views
 from pipelines.mlflow_tracker import MlflowTracker, addresses
 from pipelines.names import HEADLINES, full, shown
 from pipelines.overview import Overview, Run, figure, so_far, table
@@ -94,11 +94,11 @@ def test_a_view_is_a_tag_that_unpacks_to_its_state() -> None:
 def test_charts_are_grouped_by_arm_and_show_the_headlines_first() -> None:
     curves, finals, every = views.views(PARAMS, STUDY.arms)
     for view in (curves, finals):
-        assert view.state["groupBy"]["groupByKeys"] == [{"mode": "tag", "groupByData": "variant"}]
+        assert view.state["groupBy"]["groupByKeys"] == [{"mode": "tag", "groupByData": "legend"}]
     assert every.state["groupBy"] is None
     lines = [chart["metricKey"] for chart in curves.state["compareRunCharts"] if chart["type"] == "LINE"]
     assert lines == ["return", "coverage", "landmarks_covered", "collisions", "steps_per_second"]
-    assert curves.state["groupsExpanded"] == {"tag.variant.slow": False, "tag.variant.fast": False}
+    assert curves.state["groupsExpanded"] == {"tag.legend.slow": False, "tag.legend.fast": False}
     columns = finals.state["columnOrder"]
     assert columns[:3] == ["attributes.`Run Name`", "runDateAndNestInfo", "metrics.`final/return`"]
     assert columns.index("params.`algo.alpha`") < columns.index("metrics.`steps_per_second`")
@@ -146,11 +146,53 @@ def of_kind(kind: str, **algo: Any) -> Setting:
     return setting().model_copy(update={"algo": config})
 
 
-def test_the_runs_of_an_arm_have_its_colour(home: Path) -> None:
+def seen(text: str) -> str:
+    """A text without what is not seen of it."""
+    return "".join(letter for letter in text if letter not in legend.MARKS)
+
+
+@pytest.mark.parametrize(("name", "colour"), [("tag.variant.IQL", "#facb66"), ("tag.variant.no regulation", "#facb66")])
+def test_the_hash_is_that_of_mlflow(name: str, colour: str) -> None:
+    assert legend.PALETTE[legend._hash(name) % len(legend.PALETTE)] == colour  # as its page showed them
+
+
+def test_every_arm_has_a_colour_of_its_own_and_reads_as_before() -> None:
+    arms = [f"RHMC, alpha={k}" for k in range(29)]
+    legends = [legend.legend(arm, place) for place, arm in enumerate(arms)]
+    assert list(map(seen, legends)) == arms
+    hashed = [legend.PALETTE[legend._hash(legend.group(name)) % 29] for name in legends]
+    assert hashed == [legend.colour(place) for place in range(29)]
+    assert len(set(hashed)) == 29
+    assert legend.colour(29) == legend.colour(0)
+
+
+def looks(tracker: MlflowTracker) -> dict[str, tuple[str, str]]:
+    """Legend and colour of the runs, by arm."""
+    tags = [run.data.tags for run in tracker._search("tags.role = 'run'")]
+    return {one["variant"]: (one["legend"], one.get("mlflow.runColor", "")) for one in tags}
+
+
+def test_an_arm_keeps_its_colour_when_the_study_is_extended(home: Path) -> None:
     tracker = MlflowTracker(STUDY, Home(home))
-    refs = [tracker.start(CARD._replace(arm=arm, spec_id=arm)).ref for arm in ("slow", "fast", "unplanned")]
-    tags = [tracker.client.get_run(ref).data.tags for ref in refs]
-    assert [one.get("mlflow.runColor") for one in tags] == ["#1f77b4", "#ff7f0e", None]
+    for arm in ("slow", "fast", "unplanned"):
+        tracker.start(CARD._replace(arm=arm, spec_id=arm))
+    first = looks(tracker)
+    assert first == {
+        "slow": (legend.legend("slow", 0), legend.colour(0)),
+        "fast": (legend.legend("fast", 1), legend.colour(1)),
+        "unplanned": ("unplanned", ""),
+    }
+    tracker = MlflowTracker(STUDY._replace(arms=["new", "fast", "slow"]), Home(home))
+    tracker.start(CARD._replace(arm="new", spec_id="new"))
+    assert looks(tracker) == first | {"new": (legend.legend("new", 2), legend.colour(2))}
+
+
+def test_runs_of_an_earlier_version_are_coloured_by_the_next_launch(home: Path) -> None:
+    tracker = MlflowTracker(STUDY, Home(home))
+    ref = tracker.start(CARD._replace(arm="fast")).ref
+    for tag in ("legend", "mlflow.runColor"):
+        tracker.client.delete_tag(ref, tag)
+    assert looks(MlflowTracker(STUDY, Home(home))) == {"fast": (legend.legend("fast", 1), legend.colour(1))}
 
 
 @pytest.mark.parametrize("view", views.views({"iql": ["seed"]}), ids=lambda view: view.key)
@@ -165,8 +207,12 @@ def test_every_chart_is_in_a_section_and_has_a_name_of_its_own(view: views.View)
 def test_a_study_has_its_views_as_it_opens(home: Path) -> None:
     tracker = MlflowTracker(STUDY, Home(home))
     tags = tracker.client.get_experiment(tracker.experiment).tags
-    for view in views.views(STUDY.params, STUDY.arms):
+    for view in views.views(STUDY.params, [legend.legend("slow", 0), legend.legend("fast", 1)]):
         assert unpacked(tags[view.tag]) == view.state
+    assert list(map(seen, unpacked(tags["mlflow.sharedViewState.rhmc-finals"])["groupsExpanded"])) == [
+        "tag.legend.slow",
+        "tag.legend.fast",
+    ]
     found = addresses(tracker.uri, "http://127.0.0.1:5000")
     assert [(name, view) for name, view, _ in found] == [
         ("demo (quick)", "Curves by arm"),
@@ -188,7 +234,7 @@ def test_a_study_that_was_logged_without_views_gets_them_when_it_is_shown(home: 
     state = unpacked(tags["mlflow.sharedViewState.rhmc-parallel"])
     assert sorted(state["compareRunCharts"][0]["selectedParams"]) == ["algo.lr", "method", "seed"]
     finals = unpacked(tags["mlflow.sharedViewState.rhmc-finals"])
-    assert finals["groupsExpanded"] == {"tag.variant.full": False}
+    assert finals["groupBy"]["groupByKeys"] == [{"mode": "tag", "groupByData": "variant"}]
 
 
 def test_views_pass_over_stale_runs_and_the_parent(home: Path) -> None:
