@@ -32,7 +32,7 @@ NAME, BEGUN, DURATION, MODELS = (
     "duration",
     "attributes.`Models`",
 )  # columns
-LINE_HEIGHT, PARALLEL_HEIGHT = 320, 420  # pixels of a chart
+LINE_HEIGHT, PARALLEL_HEIGHT = 360, 420  # pixels of a chart
 NARROW, WIDE, LETTER, ROOM = 130, 400, 8, 40  # pixels: of a column, and of its text
 SHOWN = 100  # runs, and so arms, of a page
 
@@ -106,6 +106,7 @@ def _base(params: Params, legends: Sequence[str]) -> State:
         "runsHiddenMode": "SHOW_ALL",
         "useGroupedValuesInCharts": True,
         "hideEmptyCharts": True,
+        "globalLineChartConfig": {"xAxisKey": "step", "lineSmoothness": 0, "selectedXAxisMetricKey": ""},  # as measured
         "isAccordionReordered": True,  # sections stay in the order that is written here
         "groupBy": None,
     }
