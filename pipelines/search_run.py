@@ -128,8 +128,11 @@ def _train(search: Search, ledgers: Sequence[Ledger], book: "Book", home: Home, 
     scratch.mkdir(parents=True)
     stop, resources = scratch / "stop", search.resources
     name = home.name(search.name, search.profile)
+    session = ray_session(resources.concurrent, resources.cpus, name, home.root)
     try:
-        with ray_session(resources.concurrent * resources.cpus, name), interrupts.go_to(stop, book.board):
+        with session as remarks, interrupts.go_to(stop, book.board):
+            for remark in remarks:
+                book.board.say(remark)
             Drive(search, ledgers, Pool(resources.concurrent, resources.cpus), book, home, stop).run()
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
@@ -204,6 +207,9 @@ class Drive:
             self._end(key)
             self.book.fail(key, one.asked, result.error, result.trace)
             one.ledger.fail(one.asked, result.error)
+            return
+        if "died" in result:
+            self.book.died(one.asked)
             return
         why = self._points(key, one, result["points"])
         if why:
@@ -296,6 +302,10 @@ class Book:
     def interrupt(self, key: str, asked: Asked) -> None:
         """A trial saved itself for the next launch."""
         self._end(key, asked, "interrupted", "interrupted", "stopped; the next launch continues it")
+
+    def died(self, asked: Asked) -> None:
+        """The process that trained a trial is gone; another one continues it."""
+        self.board.say(f"{self._name(asked)}: its worker died; another one continues it")
 
     def fail(self, key: str, asked: Asked, error: str, trace: str) -> None:
         """A trial raised: keep why, go on with the others."""
