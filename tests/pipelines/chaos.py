@@ -31,6 +31,7 @@ from werkzeug.serving import WSGIRequestHandler, make_server
 
 from pipelines import ray_driver, run
 from pipelines.mlflow_tracker import open_existing
+from pipelines.names import full
 from pipelines.plan import study_card
 from pipelines.recorder import Recorder
 from pipelines.store import Home
@@ -58,6 +59,7 @@ class Run(NamedTuple):
     params: dict[str, str]
     history: dict[str, list[tuple[int, str]]]  # metric -> (step, value), doubled ones twice
     files: dict[str, str]  # name -> digest
+    models: list[str]  # its versions in the registry, by name and what they are called there
 
 
 def everything(study: Study, home: Path) -> list[Run]:
@@ -74,14 +76,15 @@ def _run(client: Any, one: Any, home: Path) -> Run:
     history = {}
     for metric in sorted(one.data.metrics):
         values = [
-            (m.step, "" if metric.startswith("time/") else m.value.hex())
+            (m.step, "" if full(metric).startswith("time/") else m.value.hex())
             for m in client.get_metric_history(ref, metric)
         ]
         history[metric] = sorted(values)
     kept = {file.path: client.download_artifacts(ref, file.path) for file in client.list_artifacts(ref)}
-    return Run(
-        name, one.info.status, one.data.params, history, {name: _digest(Path(path)) for name, path in kept.items()}
-    )
+    files = {name: _digest(Path(path)) for name, path in kept.items()}
+    versions = client.search_model_versions(f"run_id = '{ref}'")
+    models = [f"{v.name} {client.get_model_version(v.name, v.version).aliases}" for v in versions]
+    return Run(name, one.info.status, one.data.params, history, files, models)
 
 
 def _digest(path: Path) -> str:
@@ -110,6 +113,7 @@ def faults(found: list[Run], expected: list[Run]) -> dict[str, int]:
         "values doubled": sum(len(h) - len({step for step, _ in h}) for one in found for h in one.history.values()),
         "histories that differ": sum(one.history != other.history for one, other in both),
         "policies that differ": sum(one.files.get("policy.pt") != other.files.get("policy.pt") for one, other in both),
+        "models that differ": sum(one.models != other.models for one, other in both),
         "other files or params that differ": sum(
             (one.params, one.files.keys(), one.files.get("config.yaml"))
             != (other.params, other.files.keys(), other.files.get("config.yaml"))

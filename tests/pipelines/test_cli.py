@@ -97,9 +97,9 @@ def test_every_verb_explains_itself(rhmc: Rhmc, words: list[str]) -> None:
 
 def test_help_ends_with_the_exit_codes(rhmc: Rhmc) -> None:
     said = " ".join(rhmc("--help").out.split())
-    assert said.endswith("130 interrupted. Results are kept in $RHMC_HOME, or in the folder work.")
+    assert said.endswith("130 interrupted; 143 terminated. Results are kept in $RHMC_HOME, or in the folder work.")
     page = (ROOT / "docs/cli.md").read_text()
-    assert all(f"| {code} |" in page for code in (0, 1, 2, 130))
+    assert all(f"| {code} |" in page for code in (0, 1, 2, 130, 143))
 
 
 def test_the_page_of_the_command_line_names_every_verb() -> None:

@@ -101,7 +101,7 @@ def finish(home: Path, expected: bytes) -> None:
     tracker = open_existing(study_card(STUDY), Home(home))
     assert tracker is not None
     for ref in after:
-        history = tracker.client.get_metric_history(ref, "eval/return")
+        history = tracker.client.get_metric_history(ref, "return")
         assert sorted(value.step for value in history) == [200 * k for k in range(POINTS + 1)]
     assert not list(home.glob("checkpoints/*/*.pt"))
 

@@ -178,24 +178,51 @@ def test_a_registered_policy_acts_in_a_fresh_process_as_the_trainer_evaluates(ho
     assert all(torch.equal(given, wanted) for given, wanted in zip(actions, done, strict=True))
 
 
-def test_a_model_that_a_killed_launch_left_unregistered_is_taken_up(
-    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+STEPS = (
+    *("create_logged_model", "log_model_artifacts", "finalize_logged_model", "log_outputs", "create_registered_model"),
+    *("create_model_version", "set_registered_model_alias", "set_logged_model_tags"),
+)
+
+
+@pytest.mark.parametrize("step", STEPS)
+@pytest.mark.parametrize("done", [False, True])
+def test_a_launch_killed_at_any_step_of_registering_leaves_one_model_to_the_next(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str, done: bool
 ) -> None:
+    one = run("iql")
+    policy.save(tmp_path / "policy.pt", Saved(one, made(one).state_dict()["algorithm"]))
+    tracker = MlflowTracker(STUDY, Home(home))
+    client, log = tracker.client, tracker.start(CARD)
+    real = getattr(client, step)
+
     def killed(*args: object, **options: object) -> None:
+        if done:
+            real(*args, **options)
         raise KeyboardInterrupt
 
+    with monkeypatch.context() as patch:
+        patch.setattr(client, step, killed)
+        with pytest.raises(KeyboardInterrupt):
+            log.model(tmp_path / "policy.pt")
+    log.model(tmp_path / "policy.pt")
+    (version,) = client.search_model_versions()
+    (model,) = client.search_logged_models([tracker.experiment])
+    (output,) = client.get_run(log.ref).outputs.model_outputs
+    assert (output.model_id, model.status, f"/{model.model_id}/" in version.source) == (model.model_id, "READY", True)
+    assert client.get_model_version_by_alias(version.name, "seed-5").version == version.version
+    assert version.name in model.tags["mlflow.modelVersions"]
+
+
+def test_a_version_that_a_dying_server_made_twice_is_kept_once(home: Path, tmp_path: Path) -> None:
     one = run("iql")
     policy.save(tmp_path / "policy.pt", Saved(one, made(one).state_dict()["algorithm"]))
     tracker = MlflowTracker(STUDY, Home(home))
     log = tracker.start(CARD)
-    with monkeypatch.context() as patch:
-        patch.setattr(tracker.client, "create_model_version", killed)
-        with pytest.raises(KeyboardInterrupt):
-            log.model(tmp_path / "policy.pt")
     log.model(tmp_path / "policy.pt")
     (version,) = tracker.client.search_model_versions()
-    outputs = tracker.client.get_run(log.ref).outputs.model_outputs
-    assert [f"/{output.model_id}/" in version.source for output in outputs] == [True]
+    tracker.client.create_model_version(version.name, version.source, log.ref)
+    log.model(tmp_path / "policy.pt")
+    assert [found.version for found in tracker.client.search_model_versions()] == [version.version]
 
 
 def test_a_policy_that_cannot_be_read_is_a_fault_of_the_store(home: Path, tmp_path: Path) -> None:
