@@ -12,6 +12,7 @@ from typing import Any
 
 import ray
 from ray import tune
+from ray.exceptions import RayError
 from ray.tune.experiment import Trial
 
 from pipelines.cluster import DEATHS, Deaths, Place, address, knock, outline, survey, travelling
@@ -106,7 +107,7 @@ def _started(cpus: int, name: str) -> Iterator[None]:
 def _explained(where: str) -> Iterator[None]:
     try:
         yield
-    except (ConnectionError, OSError, RuntimeError, ValueError) as error:
+    except (ConnectionError, OSError, RuntimeError, ValueError, RayError) as error:
         raise StoreError(f"Ray cannot be used, {where}: {one_line(error)}") from error
 
 
