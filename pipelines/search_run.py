@@ -26,7 +26,7 @@ from pipelines.run import BAD, DONE, FAILED, TERMINATED, Interrupts, set_up_ray
 from pipelines.search import Search
 from pipelines.store import Checkpoints, Home, StoreError
 from pipelines.tracker import Card, RunLog, Status, StudyCard, Tracker
-from pipelines.trials import OBJECTIVE, Asked, Ledger, explained, look, open_storage, storage_url
+from pipelines.trials import OBJECTIVE, Asked, BaseStorage, Ledger, explained, look, opened, storage_url
 from rhmc.types import Metrics
 
 if TYPE_CHECKING:
@@ -67,8 +67,9 @@ def run_search(search: Search, home: Path, out: Path | None = None) -> int:
     try:
         with interrupts:
             place.prepare()
-            with place.lock(search.name, search.profile):
-                return _launch(search, place, out or found_folder(search, place), interrupts)
+            with place.lock(search.name, search.profile), opened(place) as storage:
+                assert storage is not None
+                return _launch(search, place, storage, out or found_folder(search, place), interrupts)
     except StoreError as error:
         print(f"rhmc: {error}", file=sys.stderr)
         return BAD
@@ -90,12 +91,10 @@ def plots_folder(search: Search, home: Home) -> Path:
     return home.root / "searches" / f"{search.name}-{search.profile}"
 
 
-def _launch(search: Search, home: Home, out: Path, interrupts: Interrupts) -> int:
+def _launch(search: Search, home: Home, storage: BaseStorage, out: Path, interrupts: Interrupts) -> int:
     from pipelines.mlflow_tracker import MlflowTracker  # 3 s: only when something is launched
 
     code, url = fingerprint(), storage_url(home)
-    storage = open_storage(home)
-    assert storage is not None
     tracker = MlflowTracker(search_card(search), home)
     status: Status = "interrupted"
     try:
@@ -425,8 +424,7 @@ def show_search(search: Search, home: Path) -> int:
     """
     place, code = Home(home), fingerprint()
     try:
-        storage = open_storage(place, write=False)
-        with explained(storage_url(place)):
+        with opened(place, write=False) as storage, explained(storage_url(place)):
             if storage is None:
                 print(f"{search.name} ({search.profile}): nothing has been tried yet")
                 return FAILED

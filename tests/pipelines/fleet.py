@@ -7,7 +7,6 @@ import os
 import pwd
 import secrets
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -201,11 +200,3 @@ class Cluster:
 
         wait_for(joined, "Ray's node")
         return Node(process)
-
-
-def end(process: subprocess.Popen[Any]) -> None:
-    """Kill a driver and what it started."""
-    with suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
-    kill(process.pid)
-    process.wait()

@@ -1,6 +1,5 @@
 """Past one machine: what a cluster has to be, and a study and a search on one whose node dies in the middle."""
 
-import os
 import shutil
 import socket
 import subprocess
@@ -21,16 +20,20 @@ from pipelines.export import export_study
 from pipelines.mlflow_tracker import open_existing
 from pipelines.plan import study_card
 from pipelines.run import show_status
+from pipelines.search import Search
+from pipelines.search_run import search_card, show_search
+from pipelines.seeds import Seeds
 from pipelines.store import Home, StoreError
+from pipelines.study import Setting
+from rhmc.types import Metrics
 from tests.pipelines.chaos import everything, faults, launch
 from tests.pipelines.fleet import (
     ROOT,
-    SETTINGS,
     Cluster,
     Node,
-    end,
     postgres,
     postgres_programs,
+    program,
     tracking_server,
     wait_for,
 )
@@ -168,12 +171,31 @@ def at_site(site: Site, monkeypatch: pytest.MonkeyPatch) -> Site:
     return site
 
 
-def driver(arguments: list[str], site: Site, home: Path) -> subprocess.Popen[str]:
-    """A launch on the cluster."""
-    environment = os.environ | SETTINGS | {"RAY_ADDRESS": site.cluster.address, "RHMC_HOME": str(home)}
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    command = [sys.executable, "-W", "ignore", "-m", *arguments]
-    return subprocess.Popen(command, cwd=home, env=environment, start_new_session=True, **pipes)  # type: ignore[call-overload, no-any-return]
+class Launch:
+    """A driver that is a process of its own."""
+
+    def __init__(self, process: subprocess.Popen[bytes], log: Path) -> None:
+        self.process, self.log = process, log
+
+    def said(self) -> str:
+        """What it has said so far. It must not have ended with another exit code than 0."""
+        assert self.process.poll() in (None, 0), self.log.read_text()
+        return self.log.read_text()
+
+    def end(self) -> str:
+        """All that it says."""
+        self.process.wait(300)
+        return self.said()
+
+
+@contextmanager
+def driver(arguments: list[str], site: Site, home: Path) -> Iterator[Launch]:
+    """A launch on the cluster, killed at the end of the block should it still run."""
+    log = home / "driver.log"
+    log.unlink(missing_ok=True)
+    settings = {"RAY_ADDRESS": site.cluster.address, "RHMC_HOME": str(home)}
+    with program([sys.executable, "-W", "ignore", "-m", *arguments], log, cwd=home, env=settings) as process:
+        yield Launch(process, log)
 
 
 def nodes_of(home: Path) -> dict[str, tuple[str, list[str]]]:
@@ -196,24 +218,20 @@ def test_a_study_survives_the_death_of_a_node(
     home = tmp_path / "shared"
     home.mkdir()
     other = at_site.cluster.start()
-    process = driver(["tests.pipelines.support", str(home), str(POINTS)], at_site, home)
 
     def on_the_other() -> str | None:
         """A run with a checkpoint that is on that node, once the head trains as well."""
-        assert process.poll() is None, process.communicate()[0]
+        launched.said()
         found = nodes_of(home) if list(home.glob("checkpoints/*/0*.pt")) else {}
         there = [key for key, (_, places) in found.items() if other.trained(places[-1])]
         if not there or not any(at_site.head.trained(places[-1]) for _, places in found.values()):
             return None
         return there[0] if list(home.glob(f"checkpoints/{there[0]}/0*.pt")) else None
 
-    try:
+    with driver(["tests.pipelines.support", str(home), str(POINTS)], at_site, home) as launched:
         victim = wait_for(on_the_other, "training on both nodes")
         other.kill()
-        out = process.communicate(timeout=300)[0]
-    finally:
-        end(process)
-    assert process.returncode == 0, out
+        out = launched.end()
     assert "its worker died; another one continues it" in out
     assert "failed" not in out
     assert "2 nodes, 2 processors, 2 runs at a time" in out
@@ -243,3 +261,59 @@ def assert_as_undisturbed(
     assert faults(found, expected) == dict.fromkeys(faults([], []), 0)
     for name in ("tiny.parquet",):
         assert (folder / "out" / name).read_bytes() == (whole / "out" / name).read_bytes()
+
+
+SEARCH = """\
+question: Which?
+base:
+  env: {kind: coverage, agents: 2, targets: 2}
+  algo: {kind: iql, warmup: 64, batch: 32, steps_per_update: 16, hidden: 16, buffer: 400}
+  trainer: {num_envs: 8, evaluations: 8, eval_episodes: 4, final_episodes: 8}
+arms: {IQL: {space: {lr: {low: 1e-4, high: 1e-2, log: true}}}}
+trials: 2
+seeds: 2
+steps: 1600
+sampler: {startup: 2}
+resources: {concurrent: 1, checkpoint_every: 1}
+"""
+
+
+@pytest.mark.ray
+@needs_postgres
+def test_a_search_in_postgresql_is_killed_and_goes_on_with_more_trials(
+    tmp_path: Path, at_site: Site, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "search_x.yaml").write_text(SEARCH)
+    monkeypatch.chdir(tmp_path)
+    command = ["pipelines.cli", "search", "run", "search_x.yaml"]
+    with driver(command, at_site, tmp_path) as launched:
+        wait_for(lambda: launched.said() and list(tmp_path.glob("checkpoints/*/0*.pt")), "a trial under way")
+    more = Search.load("search_x.yaml", overrides=["trials=3"])
+    assert show_search(more, tmp_path) == 1
+    with driver([*command, "--set", "trials=3", "--out", "found"], at_site, tmp_path) as launched:
+        out = launched.end()
+    assert "IQL: 0 of 3 trials are done, 1 are taken up" in out
+    assert (tmp_path / "found" / "search_x.iql.quick.yaml").exists()
+    assert not (tmp_path / "optuna.db").exists()
+    assert show_search(more, tmp_path) == 0
+    tracker = open_existing(search_card(more), Home(tmp_path))
+    assert tracker is not None
+    found = {run.data.tags["trial"]: run for run in tracker._search("tags.role = 'run'")}
+    assert {run.info.status for run in found.values()} == {"FINISHED"}
+    assert sorted(found) == ["0", "1", "2"]
+    killed = found["0"]
+    rows = [row for row in tracker.rows([killed.info.run_id]) if row.metric == "eval/return"]
+    setting = more.arms["IQL"].at({"lr": float(killed.data.params["algo.lr"])})
+    expected = [(int(point["step"]), point["eval/return"]) for point in trained(setting, more)]
+    assert [(row.step, row.value) for row in rows] == expected
+    history = tracker.client.get_metric_history(killed.info.run_id, "return")
+    assert sorted(value.step for value in history) == [step for step, _ in expected]
+
+
+def trained(setting: Setting, search: Search) -> list[Metrics]:
+    """The points of a trial that nobody disturbed."""
+    seeds = Seeds(setting, search.seed_list())
+    points = []
+    while not seeds.done:
+        points.append(next(seeds))
+    return points
