@@ -180,10 +180,13 @@ def train(study: Study, recorder: Recorder, home: Home, interrupts: Interrupts) 
         }
         for item in recorder.todo()
     ]
-    cpus = study.resources.concurrent * study.resources.cpus
+    concurrent, cpus = study.resources.concurrent, study.resources.cpus
+    session = ray_session(concurrent, cpus, home.name(study.name, study.profile), home.root)
     try:
-        with ray_session(cpus, home.name(study.name, study.profile)), interrupts.go_to(stop, recorder.board):
-            fit(jobs, recorder, scratch, study.resources.concurrent, study.resources.cpus, stop)
+        with session as remarks, interrupts.go_to(stop, recorder.board):
+            for remark in remarks:
+                recorder.board.say(remark)
+            fit(jobs, recorder, scratch, concurrent, cpus, stop)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
 

@@ -209,7 +209,7 @@ def _drive(study: str, home: str, uri: str | None, length: int, room: int | None
         os.environ["MLFLOW_TRACKING_URI"] = uri
     os.environ["MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR"] = "0"  # at most a second between two tries
     run.fingerprint = lambda: CODE
-    ray_driver.ray_session = lambda *args: nullcontext()
+    ray_driver.ray_session = lambda *args: nullcontext([])
     ray_driver.fit = fit_here
     fuse = Fuse(length)
     fuse.lay(home)
