@@ -46,6 +46,7 @@ BATCH = 1000  # values that one request may carry
 PARENT = "study"  # tag `role` of the parent run; its runs have `run`
 PATIENCE = 20.0  # seconds that a reader waits for a writer of SQLite, as MLflow's own do
 NOTE = "mlflow.note.content"  # the tag that MLflow shows as a description
+LONGEST = 8000  # characters of a run's tag
 
 
 def tracking_uri(home: Home) -> str:
@@ -114,8 +115,8 @@ class MlflowTracker:
 
     def _describe(self, ref: str, note: str) -> None:
         assert self.experiment is not None
-        self.client.set_experiment_tag(self.experiment, NOTE, note)
-        self.client.set_tag(ref, NOTE, note)
+        self.client.set_experiment_tag(self.experiment, NOTE, fitting(note))
+        self.client.set_tag(ref, NOTE, fitting(note))
 
     def _only(self, query: str, name: str, tags: dict[str, str], variant: str | None = None) -> Run:
         """The one run that matches, made if there is none.
@@ -323,6 +324,12 @@ class MlflowRun:
         if address.scheme in ("", "file") and folder.is_dir():
             for path in (*folder.rglob("*"), folder, *list(folder.parents)[:3]):
                 sync(path)
+
+
+def fitting(note: str) -> str:
+    """As much of a description as MLflow keeps, in whole lines: it refuses a longer one, or cuts it anywhere."""
+    cut = "\n\nCut short: MLflow keeps no more.\n"
+    return note if len(note) <= LONGEST else note[: LONGEST - len(cut)].rpartition("\n")[0] + cut
 
 
 def addresses(uri: str, server: str) -> list[tuple[str, str, str]]:

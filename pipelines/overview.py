@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from io import BytesIO, StringIO
 from typing import NamedTuple
 
-from pipelines.plan import Item
+from pipelines.plan import LISTED, Item, more
 from pipelines.tracker import Row, Status, StudyCard, Tracker
 from rhmc.types import Metrics
 
@@ -103,12 +103,13 @@ def so_far(runs: Sequence[Run]) -> str:
     shown = {key: name for key, name in FINALS.items() if any(key in run.finals for run in runs)}
     heads = ["arm", "finished seeds", "others", *(f"final {name}" for name in shown.values())]
     lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
-    for arm, mine in by_arm(runs).items():
+    arms = by_arm(runs)
+    for arm, mine in list(arms.items())[:LISTED]:
         done = [run for run in mine if run.status == "finished"]
         seeds = ", ".join(str(run.seed) for run in done) or "none"
         means = [_mean_and_range([run.finals[key] for run in done if key in run.finals]) for key in shown]
         lines.append(f"| {' | '.join([_cell(arm), seeds, _others(mine), *means])} |")
-    return "\n".join([f"### So far\n\n{_ahead(runs)}\n", *lines])
+    return "\n".join([f"### So far\n\n{_ahead(runs)}\n", *lines, *more(list(arms))])
 
 
 def _ahead(runs: Sequence[Run]) -> str:

@@ -2,7 +2,7 @@
 
 import json
 import subprocess
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from io import StringIO
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,6 +12,7 @@ from ruamel.yaml import YAML
 from pipelines.study import RunSpec, Study, changes
 from pipelines.tracker import Card, Recorded, StudyCard
 
+LISTED = 25  # arms that a description names: MLflow keeps 8,000 characters of one
 KIND = "algo.kind"  # which is what the param `method` says
 
 
@@ -77,9 +78,14 @@ def study_card(study: Study) -> StudyCard:
     note = (
         f"{study.question}\n\n"
         f"Profile `{study.profile}`: {len(arms)} arms × {len(seeds)} seeds, {budget} environment steps each.\n\n"
-        + "\n".join(f"- **{arm}**: {_differs(study, arm)}" for arm in arms)
+        + "\n".join([*(f"- **{arm}**: {_differs(study, arm)}" for arm in arms[:LISTED]), *more(arms)])
     )
     return StudyCard(study.name, study.profile, note, ("method", *params, "seed"))
+
+
+def more(arms: Sequence[str]) -> list[str]:
+    """The line of a description that stands for the arms that are not listed, if any."""
+    return [f"\n{len(arms) - LISTED:,} more arms are not listed here."] if len(arms) > LISTED else []
 
 
 def _differs(study: Study, arm: str) -> str:

@@ -6,7 +6,7 @@ import shlex
 import shutil
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -50,12 +50,24 @@ def run_study(study: Study, home: Path) -> int:
         0 all finished, 1 some run failed, 2 something is in the way, 130 interrupted, 143 terminated. A second launch
         is always safe.
     """
+    return guarded(home, study.name, study.profile, lambda place, interrupts: _launch(study, place, interrupts))
+
+
+def guarded(home: Path, name: str, profile: str, launch: Callable[[Home, "Interrupts"], int]) -> int:
+    """Hold a study or a search while it is launched; what is in the way becomes one line and an exit code.
+
+    Args:
+        home: the work folder.
+        name: of the study or search.
+        profile: its profile.
+        launch: the work; gives the exit code.
+    """
     place, interrupts = Home(home), Interrupts()
     try:
         with interrupts:
             place.prepare()
-            with place.lock(study.name, study.profile):
-                return _launch(study, place, interrupts)
+            with place.lock(name, profile):
+                return launch(place, interrupts)
     except StoreError as error:
         print(f"rhmc: {error}", file=sys.stderr)
         return BAD

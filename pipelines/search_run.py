@@ -22,7 +22,7 @@ from pipelines.fingerprint import fingerprint
 from pipelines.found import file_name, slug, winner_yaml, write_text
 from pipelines.plan import commit
 from pipelines.progress import Board, board, print_table
-from pipelines.run import BAD, DONE, FAILED, TERMINATED, Interrupts, set_up_ray
+from pipelines.run import BAD, DONE, FAILED, Interrupts, guarded, set_up_ray
 from pipelines.search import Search
 from pipelines.store import Checkpoints, Home, StoreError
 from pipelines.tracker import Card, RunLog, Status, StudyCard, Tracker
@@ -63,22 +63,13 @@ def run_search(search: Search, home: Path, out: Path | None = None) -> int:
     Returns:
         0 every trial is finished or pruned, 1 some failed, 2 something is in the way, 130 interrupted, 143 terminated.
     """
-    place, interrupts = Home(home), Interrupts()
-    try:
-        with interrupts:
-            place.prepare()
-            with place.lock(search.name, search.profile), opened(place) as storage:
-                assert storage is not None
-                return _launch(search, place, storage, out or found_folder(search, place), interrupts)
-    except StoreError as error:
-        print(f"rhmc: {error}", file=sys.stderr)
-        return BAD
-    except KeyboardInterrupt:
-        print("rhmc: interrupted; the same command continues", file=sys.stderr)
-        return interrupts.code
-    except SystemExit:  # Ray's answer to SIGTERM while it starts
-        print("rhmc: terminated; the same command continues", file=sys.stderr)
-        return TERMINATED
+
+    def launch(place: Home, interrupts: Interrupts) -> int:
+        with opened(place) as storage:
+            assert storage is not None
+            return _launch(search, place, storage, out or found_folder(search, place), interrupts)
+
+    return guarded(home, search.name, search.profile, launch)
 
 
 def found_folder(search: Search, home: Home) -> Path:

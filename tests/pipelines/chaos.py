@@ -22,6 +22,7 @@ from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import psutil
 import ray.tune.trainable.trainable
 import torch
 from mlflow.entities import ViewType
@@ -44,6 +45,7 @@ PRELOAD = ["mlflow.server", "mlflow.store.tracking.sqlalchemy_store"]
 FORKS = multiprocessing.get_context("forkserver")
 WRITES = ("INSERT", "UPDATE", "DELETE")
 KILLED = -signal.SIGKILL
+WORKER = "Trainable"  # in what Ray calls a process that trains, idle or at work
 FOREVER = 0  # a fuse that never burns down
 DAMAGES = ("cut short", "empty", "zeros inside", "noise inside", "noise")
 
@@ -120,6 +122,19 @@ def faults(found: list[Run], expected: list[Run]) -> dict[str, int]:
             for one, other in both
         ),
     }
+
+
+# Processes to be killed
+
+
+def started_by(driver: int, name: str = "") -> list[psutil.Process]:
+    """What runs in the session of a driver, which may be gone, and has `name` in its command line."""
+    found = []
+    for process in psutil.process_iter():
+        with suppress(psutil.Error, OSError):
+            if os.getsid(process.pid) == driver and process.status() != psutil.STATUS_ZOMBIE:
+                found += [process] if name in " ".join(process.cmdline()) else []
+    return found
 
 
 # Processes that kill themselves
