@@ -13,6 +13,7 @@ import urllib.request
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
+from http.client import HTTPException
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -21,7 +22,7 @@ from filelock import FileLock
 
 from pipelines import names, views
 from pipelines.errors import InputError
-from pipelines.store import Home, StoreError, one_line, replace_durably, sync
+from pipelines.store import Home, StoreError, one_line, replace_durably, sync, without_password
 from pipelines.tracker import Card, Recorded, Row, Status, StudyCard, unseen
 from rhmc.types import Metrics
 
@@ -42,6 +43,7 @@ STATUS: dict[Status, str] = {
     "interrupted": "KILLED",
 }
 FROM_MLFLOW: dict[str, Status] = {theirs: ours for ours, theirs in STATUS.items()}
+SERVER = ("http://", "https://")  # how the address of one begins
 BATCH = 1000  # values that one request may carry
 PARENT = "study"  # tag `role` of the parent run; its runs have `run`
 PATIENCE = 20.0  # seconds that a reader waits for a writer of SQLite, as MLflow's own do
@@ -89,7 +91,7 @@ class MlflowTracker:
         name = experiment_name(self.study)
         found = self.client.get_experiment_by_name(name)
         if found is None and write:
-            return self._create_experiment(name, home.artifacts.as_uri() if self.uri.startswith("sqlite:") else None)
+            return self._create_experiment(name, None if self.served else home.artifacts.as_uri())
         if found is not None and found.lifecycle_stage != "active":
             if not write:
                 return None
@@ -262,7 +264,12 @@ class MlflowTracker:
 
     def where(self) -> str:
         """How to look at the experiment: a command, or a server's address."""
-        return self.uri if self.uri.startswith(("http://", "https://")) else "rhmc ui"
+        return without_password(self.uri) if self.served else "rhmc ui"
+
+    @property
+    def served(self) -> bool:
+        """Whether a server keeps the log, and its files."""
+        return self.uri.startswith(SERVER)
 
 
 class MlflowRun:
@@ -458,8 +465,10 @@ def check(uri: str) -> None:
     """
     if uri.startswith("sqlite:"):
         _check_file(sqlite_file(uri))
-    elif uri.startswith(("http://", "https://")):
+    elif uri.startswith(SERVER):
         _check_server(uri)
+    elif "://" not in uri:
+        raise StoreError(f"MLFLOW_TRACKING_URI={uri}: not an address; http://HOST:PORT and sqlite:///FILE are some")
 
 
 def _check_file(path: Path) -> None:
@@ -499,13 +508,16 @@ def create_database(path: Path) -> None:
 
 
 def _check_server(uri: str) -> None:
+    place = urllib.parse.urlsplit(uri)
+    bare = place._replace(netloc=place.netloc.rpartition("@")[2]).geturl()  # this page asks for no name
     try:
-        urllib.request.urlopen(f"{uri.rstrip('/')}/health", timeout=10).close()
+        urllib.request.urlopen(f"{bare.rstrip('/')}/health", timeout=10).close()
     except urllib.error.HTTPError:
         pass  # it answers; a server behind a gateway may lack this page
-    except OSError as error:
+    except (OSError, HTTPException) as error:
         reason: Any = getattr(error, "reason", error)
-        raise StoreError(f"{uri}: the MLflow server does not answer ({reason}); see MLFLOW_TRACKING_URI") from error
+        shown = without_password(uri)
+        raise StoreError(f"{shown}: the MLflow server does not answer ({reason}); see MLFLOW_TRACKING_URI") from error
 
 
 @contextmanager
@@ -516,4 +528,4 @@ def explained(uri: str) -> Iterator[None]:
     except StoreError:
         raise
     except (MlflowException, SQLAlchemyError, sqlite3.Error, OSError, ImportError) as error:
-        raise StoreError(f"{uri}: MLflow cannot go on: {one_line(error)}") from error
+        raise StoreError(f"{without_password(uri)}: MLflow cannot go on: {one_line(error)}") from error

@@ -15,7 +15,7 @@ from mlflow import MlflowClient
 from pipelines import histories, mlflow_tracker
 from pipelines.mlflow_tracker import MlflowTracker, open_existing
 from pipelines.names import shown
-from pipelines.store import Home, StoreError
+from pipelines.store import Home, StoreError, without_password
 from pipelines.tracker import Card, MemoryRun, MemoryTracker, Row, StudyCard, Tracker, points_of
 from tests.pipelines.chaos import Server
 
@@ -348,6 +348,21 @@ def test_a_server_that_does_not_answer(home: Path, monkeypatch: pytest.MonkeyPat
         uri = f"http://127.0.0.1:{free.getsockname()[1]}"
     monkeypatch.setenv("MLFLOW_TRACKING_URI", uri)
     assert refused(home).startswith(f"{uri}: the MLflow server does not answer")
+
+
+def test_a_password_is_shown_nowhere(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for uri in ("http://me:secret@127.0.0.1:1", "postgresql://me:secret@127.0.0.1:1/mlflow"):
+        monkeypatch.setenv("MLFLOW_TRACKING_URI", uri)
+        said = refused(home)
+        assert said.startswith(uri.replace("secret", "***"))
+        assert "refused" in said
+        assert "secret" not in said
+    assert without_password("http://[") == "http://["
+
+
+def test_an_address_without_its_kind(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "127.0.0.1:5000")
+    assert refused(home).startswith("MLFLOW_TRACKING_URI=127.0.0.1:5000: not an address; http://HOST:PORT")
 
 
 def test_a_store_in_no_folder(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
