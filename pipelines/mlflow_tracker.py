@@ -13,6 +13,7 @@ import urllib.request
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
+from http.client import HTTPException
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -21,7 +22,7 @@ from filelock import FileLock
 
 from pipelines import names, views
 from pipelines.errors import InputError
-from pipelines.store import Home, StoreError, one_line, replace_durably, sync
+from pipelines.store import Home, StoreError, one_line, replace_durably, sync, without_password
 from pipelines.tracker import Card, Recorded, Row, Status, StudyCard, unseen
 from rhmc.types import Metrics
 
@@ -42,6 +43,7 @@ STATUS: dict[Status, str] = {
     "interrupted": "KILLED",
 }
 FROM_MLFLOW: dict[str, Status] = {theirs: ours for ours, theirs in STATUS.items()}
+SERVER = ("http://", "https://")  # how the address of one begins
 BATCH = 1000  # values that one request may carry
 PARENT = "study"  # tag `role` of the parent run; its runs have `run`
 PATIENCE = 20.0  # seconds that a reader waits for a writer of SQLite, as MLflow's own do
@@ -89,7 +91,7 @@ class MlflowTracker:
         name = experiment_name(self.study)
         found = self.client.get_experiment_by_name(name)
         if found is None and write:
-            return self._create_experiment(name, home.artifacts.as_uri() if self.uri.startswith("sqlite:") else None)
+            return self._create_experiment(name, None if self.served else home.artifacts.as_uri())
         if found is not None and found.lifecycle_stage != "active":
             if not write:
                 return None
@@ -203,18 +205,23 @@ class MlflowTracker:
         }
 
     def rows(self, refs: Sequence[str]) -> list[Row]:
-        """See `Tracker`. One query where the store is SQLite, else a request per run and metric."""
+        """See `Tracker`. One query where the store is SQLite, else a request per metric and a hundred runs."""
         with explained(self.uri):
             found = self._rows_sqlite(refs) if self.uri.startswith("sqlite:") else self._rows_client(refs)
         return sorted(found)
 
     def _rows_client(self, refs: Sequence[str]) -> Iterator[Row]:
-        for ref in refs:
-            for metric in self.client.get_run(ref).data.metrics:
-                first: dict[int, float] = {}
-                for value in self.client.get_metric_history(ref, metric):
-                    first.setdefault(value.step, value.value)
-                yield from (Row(ref, step, names.full(metric), value) for step, value in first.items())
+        from pipelines.histories import Histories
+
+        first: dict[tuple[str, int, str], float] = {}
+        for one in Histories(self.client, self.uri).of(self._runs(refs)):
+            first.setdefault((one.ref, one.step, names.full(one.metric)), one.value)
+        return (Row(*place, value) for place, value in first.items())
+
+    def _runs(self, refs: Sequence[str]) -> Iterator[Run]:
+        """The runs of these names, of whatever study."""
+        mine = {run.info.run_id: run for run in self._search("tags.role = 'run'")} if len(refs) > 1 else {}
+        return (mine[ref] if ref in mine else self.client.get_run(ref) for ref in refs)
 
     def _rows_sqlite(self, refs: Sequence[str]) -> Iterator[Row]:
         """The client's answer, read from MLflow's table `metrics` at once."""
@@ -257,7 +264,12 @@ class MlflowTracker:
 
     def where(self) -> str:
         """How to look at the experiment: a command, or a server's address."""
-        return self.uri if self.uri.startswith(("http://", "https://")) else "rhmc ui"
+        return without_password(self.uri) if self.served else "rhmc ui"
+
+    @property
+    def served(self) -> bool:
+        """Whether a server keeps the log, and its files."""
+        return self.uri.startswith(SERVER)
 
 
 class MlflowRun:
@@ -453,8 +465,10 @@ def check(uri: str) -> None:
     """
     if uri.startswith("sqlite:"):
         _check_file(sqlite_file(uri))
-    elif uri.startswith(("http://", "https://")):
+    elif uri.startswith(SERVER):
         _check_server(uri)
+    elif "://" not in uri:
+        raise StoreError(f"MLFLOW_TRACKING_URI={uri}: not an address; http://HOST:PORT and sqlite:///FILE are some")
 
 
 def _check_file(path: Path) -> None:
@@ -494,13 +508,16 @@ def create_database(path: Path) -> None:
 
 
 def _check_server(uri: str) -> None:
+    place = urllib.parse.urlsplit(uri)
+    bare = place._replace(netloc=place.netloc.rpartition("@")[2]).geturl()  # this page asks for no name
     try:
-        urllib.request.urlopen(f"{uri.rstrip('/')}/health", timeout=10).close()
+        urllib.request.urlopen(f"{bare.rstrip('/')}/health", timeout=10).close()
     except urllib.error.HTTPError:
         pass  # it answers; a server behind a gateway may lack this page
-    except OSError as error:
+    except (OSError, HTTPException) as error:
         reason: Any = getattr(error, "reason", error)
-        raise StoreError(f"{uri}: the MLflow server does not answer ({reason}); see MLFLOW_TRACKING_URI") from error
+        shown = without_password(uri)
+        raise StoreError(f"{shown}: the MLflow server does not answer ({reason}); see MLFLOW_TRACKING_URI") from error
 
 
 @contextmanager
@@ -511,4 +528,4 @@ def explained(uri: str) -> Iterator[None]:
     except StoreError:
         raise
     except (MlflowException, SQLAlchemyError, sqlite3.Error, OSError, ImportError) as error:
-        raise StoreError(f"{uri}: MLflow cannot go on: {one_line(error)}") from error
+        raise StoreError(f"{without_password(uri)}: MLflow cannot go on: {one_line(error)}") from error

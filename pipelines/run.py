@@ -18,7 +18,7 @@ from pipelines.fingerprint import fingerprint
 from pipelines.plan import Item, commit, finished, items, study_card
 from pipelines.progress import Board, board, print_table
 from pipelines.recorder import Recorder
-from pipelines.store import Home, StoreError
+from pipelines.store import Home, StoreError, without_password
 from pipelines.study import Study
 from pipelines.tracker import Status, Tracker
 
@@ -217,7 +217,7 @@ def _summary(study: Study, recorder: Recorder, tracker: "MlflowTracker") -> None
     next_command += "   (continues)" if recorder.left else ""
     lines = [
         f"look:  {tracker.where()}",
-        f"       experiment {tracker.name!r} in {tracker.uri}",
+        f"       experiment {tracker.name!r} in {without_password(tracker.uri)}",
         f"next:  {next_command}",
     ]
     console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)

@@ -24,7 +24,7 @@ from pipelines.plan import commit
 from pipelines.progress import Board, board, print_table
 from pipelines.run import BAD, DONE, FAILED, Interrupts, guarded, set_up_ray
 from pipelines.search import Search
-from pipelines.store import Checkpoints, Home, StoreError
+from pipelines.store import Checkpoints, Home, StoreError, without_password
 from pipelines.tracker import Card, RunLog, Status, StudyCard, Tracker
 from pipelines.trials import OBJECTIVE, Asked, BaseStorage, Ledger, explained, look, opened, storage_url
 from rhmc.types import Metrics
@@ -379,7 +379,7 @@ def _summary(
     lines = [_best_line(ledger) for ledger in ledgers]
     lines += [f"winner: {file}" for file in written.winners]
     lines += [f"plot:   {file}" for file in written.plots]
-    lines += [f"look:   {tracker.where()}", f"        experiment {tracker.name!r} in {tracker.uri}"]
+    lines += [f"look:   {tracker.where()}", f"        experiment {tracker.name!r} in {without_password(tracker.uri)}"]
     changes = [word for text in search.overrides for word in ("--set", text)]
     again = shlex.join([search.file, "--profile", search.profile, *changes])
     lines += [] if whole else [f"next:   rhmc search run {again}   (continues)"]

@@ -10,12 +10,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from mlflow import MlflowClient
 
-from pipelines import mlflow_tracker
+from pipelines import histories, mlflow_tracker
 from pipelines.mlflow_tracker import MlflowTracker, open_existing
 from pipelines.names import shown
-from pipelines.store import Home, StoreError
+from pipelines.store import Home, StoreError, without_password
 from pipelines.tracker import Card, MemoryRun, MemoryTracker, Row, StudyCard, Tracker, points_of
+from tests.pipelines.chaos import Server
 
 STUDY = StudyCard("demo", "quick", "**Why?**")
 OTHER = StudyCard("other", "quick", "")
@@ -239,6 +241,36 @@ def test_reading_at_once_and_through_the_client_agree(home: Path) -> None:
     assert len(tracker.rows(refs)) == 2 * 3 * 5
 
 
+def test_a_server_is_asked_for_a_metric_of_many_runs_at_once(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    server = Server(home)
+    server.start()
+    asked: list[list[str]] = []
+    page, one = histories.http_request, MlflowClient.get_metric_history
+    monkeypatch.setattr(histories, "http_request", lambda *a, **k: asked.append(k["params"]["run_id"]) or page(*a, **k))
+    monkeypatch.setattr(MlflowClient, "get_metric_history", lambda *a: asked.append(a[1:2]) or one(*a))
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", server.uri)
+    try:
+        tracker = MlflowTracker(STUDY, Home(home))
+        runs = [tracker.start(CARD._replace(spec_id=f"s{number}")) for number in range(3)]
+        for number, run in enumerate(runs):
+            run.log([point(step, **{"eval/odd": math.nan, "eval/max": math.inf}) for step in range(8 * (number + 1))])
+        refs, asked[:] = [run.ref for run in runs], []
+        found = tracker.rows(refs)
+        with monkeypatch.context() as patch:
+            patch.setattr(tracker, "uri", f"sqlite:///{home}/mlflow.db")
+            alone = tracker.rows(refs)
+        assert [len(refs) for refs in asked] == [3] * 4  # one for each metric
+        assert str(found) == str(alone)
+        assert len(found) == 4 * (8 + 16 + 24)
+        for most in (17, 1):  # more than an answer holds: some are asked for in halves, some one by one
+            monkeypatch.setattr(histories, "VALUES", most)
+            assert str(tracker.rows(refs)) == str(found)
+        monkeypatch.setattr(histories, "PAGE", "/api/none")  # a server that has no such page
+        assert str(tracker.rows(refs)) == str(found)
+    finally:
+        server.kill()
+
+
 def test_a_long_history_is_logged_in_requests_of_a_thousand(home: Path) -> None:
     tracker = MlflowTracker(STUDY, Home(home))
     run = tracker.start(CARD)
@@ -316,6 +348,21 @@ def test_a_server_that_does_not_answer(home: Path, monkeypatch: pytest.MonkeyPat
         uri = f"http://127.0.0.1:{free.getsockname()[1]}"
     monkeypatch.setenv("MLFLOW_TRACKING_URI", uri)
     assert refused(home).startswith(f"{uri}: the MLflow server does not answer")
+
+
+def test_a_password_is_shown_nowhere(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for uri in ("http://me:secret@127.0.0.1:1", "postgresql://me:secret@127.0.0.1:1/mlflow"):
+        monkeypatch.setenv("MLFLOW_TRACKING_URI", uri)
+        said = refused(home)
+        assert said.startswith(uri.replace("secret", "***"))
+        assert "refused" in said
+        assert "secret" not in said
+    assert without_password("http://[") == "http://["
+
+
+def test_an_address_without_its_kind(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "127.0.0.1:5000")
+    assert refused(home).startswith("MLFLOW_TRACKING_URI=127.0.0.1:5000: not an address; http://HOST:PORT")
 
 
 def test_a_store_in_no_folder(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
