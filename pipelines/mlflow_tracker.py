@@ -11,7 +11,7 @@ import urllib.error
 import urllib.parse
 import urllib.request
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -201,29 +201,33 @@ class MlflowTracker:
             "commit": card.commit,
         }
 
-    def rows(self, refs: Sequence[str]) -> list[Row]:
-        """See `Tracker`. One query where the store is SQLite, else a request per run and metric."""
+    def rows(self, refs: Sequence[str], metrics: Collection[str] | None = None) -> list[Row]:
+        """See `Tracker`. One query for each run where the store is SQLite, else a request per run and metric."""
         with explained(self.uri):
-            found = self._rows_sqlite(refs) if self.uri.startswith("sqlite:") else self._rows_client(refs)
-        return sorted(found)
+            found = (self._rows_sqlite if self.uri.startswith("sqlite:") else self._rows_client)(refs, metrics)
+            return sorted(found)
 
-    def _rows_client(self, refs: Sequence[str]) -> Iterator[Row]:
+    def _rows_client(self, refs: Sequence[str], metrics: Collection[str] | None = None) -> Iterator[Row]:
         for ref in refs:
             for metric in self.client.get_run(ref).data.metrics:
+                if metrics is not None and names.full(metric) not in metrics:
+                    continue
                 first: dict[int, float] = {}
                 for value in self.client.get_metric_history(ref, metric):
                     first.setdefault(value.step, value.value)
                 yield from (Row(ref, step, names.full(metric), value) for step, value in first.items())
 
-    def _rows_sqlite(self, refs: Sequence[str]) -> Iterator[Row]:
+    def _rows_sqlite(self, refs: Sequence[str], metrics: Collection[str] | None = None) -> Iterator[Row]:
         """The client's answer, read from MLflow's table `metrics` at once."""
-        first: dict[tuple[str, int, str], float] = {}
-        query = "SELECT run_uuid, step, key, value, is_nan FROM metrics WHERE run_uuid = ? ORDER BY timestamp"
+        keys = sorted({name for metric in metrics or () for name in (metric, names.shown(metric))})
+        some = f" AND key IN ({', '.join('?' * len(keys))})" if metrics is not None else ""
+        query = f"SELECT step, key, value, is_nan FROM metrics WHERE run_uuid = ?{some} ORDER BY timestamp"
         with closing(connect(sqlite_file(self.uri))) as database:
             for ref in refs:
-                for run, step, metric, value, is_nan in database.execute(query, (ref,)).fetchall():  # let writers in
-                    first.setdefault((run, step, names.full(metric)), float("nan") if is_nan else value)
-        return (Row(*place, value) for place, value in first.items())
+                first: dict[tuple[int, str], float] = {}
+                for step, key, value, is_nan in database.execute(query, (ref, *keys)).fetchall():  # let writers in
+                    first.setdefault((step, names.full(key)), float("nan") if is_nan else value)
+                yield from (Row(ref, *place, value) for place, value in first.items())
 
     def publish(self, note: str, files: Mapping[str, bytes]) -> None:
         """See `Tracker`."""

@@ -37,12 +37,13 @@ class Recorder:
         self.failures: dict[str, str] = {}  # name of the run -> one line
         self.waiting: dict[str, list[Item]] = defaultdict(list)
         self.busy = False  # whether another process was training one of them
-        done = finished(tracker.recorded())
+        recorded = tracker.recorded()
+        done = finished(recorded)
         for item in plan:
             if (item.card.arm, item.key) not in done:
                 self.waiting[item.key].append(item)
         self.skipped = len(plan) - self.left
-        self.overview = Overview(study, plan, tracker)
+        self.overview = Overview(study, plan, tracker, recorded)
         self.overview.describe()
         self._tidy()
 
