@@ -58,6 +58,7 @@ def test_a_log_with_the_former_names_is_read_and_continued_without_doubles(home:
         (8, "eval/return", 2.0),
     ]
     assert tracker.client.get_run(log.ref).data.metrics == {"eval/return": 1.0, "return": 2.0}
+    assert tracker.rows([log.ref], {"eval/return"}) == tracker.rows([log.ref])
 
 
 @pytest.mark.parametrize("metric", [*HEADLINES.values(), "train/loss", "final/return"])
