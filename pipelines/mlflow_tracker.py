@@ -11,7 +11,7 @@ import urllib.error
 import urllib.parse
 import urllib.request
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from http.client import HTTPException
 from pathlib import Path
@@ -204,17 +204,17 @@ class MlflowTracker:
             "commit": card.commit,
         }
 
-    def rows(self, refs: Sequence[str]) -> list[Row]:
-        """See `Tracker`. One query where the store is SQLite, else a request per metric and a hundred runs."""
+    def rows(self, refs: Sequence[str], metrics: Collection[str] | None = None) -> list[Row]:
+        """See `Tracker`. SQLite: a query per run; otherwise a request per metric and a hundred runs."""
         with explained(self.uri):
-            found = self._rows_sqlite(refs) if self.uri.startswith("sqlite:") else self._rows_client(refs)
-        return sorted(found)
+            found = (self._rows_sqlite if self.uri.startswith("sqlite:") else self._rows_client)(refs, metrics)
+            return sorted(found)
 
-    def _rows_client(self, refs: Sequence[str]) -> Iterator[Row]:
+    def _rows_client(self, refs: Sequence[str], metrics: Collection[str] | None = None) -> Iterator[Row]:
         from pipelines.histories import Histories
 
         first: dict[tuple[str, int, str], float] = {}
-        for one in Histories(self.client, self.uri).of(self._runs(refs)):
+        for one in Histories(self.client, self.uri).of(self._runs(refs), keys_of(metrics)):
             first.setdefault((one.ref, one.step, names.full(one.metric)), one.value)
         return (Row(*place, value) for place, value in first.items())
 
@@ -223,15 +223,17 @@ class MlflowTracker:
         mine = {run.info.run_id: run for run in self._search("tags.role = 'run'")} if len(refs) > 1 else {}
         return (mine[ref] if ref in mine else self.client.get_run(ref) for ref in refs)
 
-    def _rows_sqlite(self, refs: Sequence[str]) -> Iterator[Row]:
+    def _rows_sqlite(self, refs: Sequence[str], metrics: Collection[str] | None = None) -> Iterator[Row]:
         """The client's answer, read from MLflow's table `metrics` at once."""
-        first: dict[tuple[str, int, str], float] = {}
-        query = "SELECT run_uuid, step, key, value, is_nan FROM metrics WHERE run_uuid = ? ORDER BY timestamp"
+        keys = sorted(keys_of(metrics) or ())
+        some = f" AND key IN ({', '.join('?' * len(keys))})" if metrics is not None else ""
+        query = f"SELECT step, key, value, is_nan FROM metrics WHERE run_uuid = ?{some} ORDER BY timestamp"
         with closing(connect(sqlite_file(self.uri))) as database:
             for ref in refs:
-                for run, step, metric, value, is_nan in database.execute(query, (ref,)).fetchall():  # let writers in
-                    first.setdefault((run, step, names.full(metric)), float("nan") if is_nan else value)
-        return (Row(*place, value) for place, value in first.items())
+                first: dict[tuple[int, str], float] = {}
+                for step, key, value, is_nan in database.execute(query, (ref, *keys)).fetchall():  # let writers in
+                    first.setdefault((step, names.full(key)), float("nan") if is_nan else value)
+                yield from (Row(ref, *place, value) for place, value in first.items())
 
     def publish(self, note: str, files: Mapping[str, bytes]) -> None:
         """See `Tracker`."""
@@ -337,6 +339,11 @@ def fitting(note: str) -> str:
     """As much of a description as MLflow keeps, in whole lines: it refuses a longer one, or cuts it anywhere."""
     cut = "\n\nCut short: MLflow keeps no more.\n"
     return note if len(note) <= LONGEST else note[: LONGEST - len(cut)].rpartition("\n")[0] + cut
+
+
+def keys_of(metrics: Collection[str] | None) -> set[str] | None:
+    """What metrics of the program may be called in MLflow; None for all."""
+    return None if metrics is None else {name for metric in metrics for name in (metric, names.shown(metric))}
 
 
 def addresses(uri: str, server: str) -> list[tuple[str, str, str]]:

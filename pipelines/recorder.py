@@ -38,12 +38,13 @@ class Recorder:
         self.waiting: dict[str, list[Item]] = defaultdict(list)
         self.places: dict[str, list[str]] = defaultdict(list)  # key -> the nodes that trained it in this launch
         self.busy = False  # whether one of them was out of reach, and may be trained by now
-        done = finished(tracker.recorded())
+        recorded = tracker.recorded()
+        done = finished(recorded)
         for item in plan:
             if (item.card.arm, item.key) not in done:
                 self.waiting[item.key].append(item)
         self.skipped = len(plan) - self.left
-        self.overview = Overview(study, plan, tracker)
+        self.overview = Overview(study, plan, tracker, recorded)
         self.overview.describe()
         self._tidy()
 

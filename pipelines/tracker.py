@@ -4,7 +4,7 @@ A run in a log is named by study, profile, arm and key (spec id and code fingerp
 already continues it. A point that is logged already is not logged again.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
@@ -113,8 +113,8 @@ class Tracker(Protocol):
         """Begin a run, or continue it."""
         ...
 
-    def rows(self, refs: Sequence[str]) -> list[Row]:
-        """All values of the runs, each metric and step once, sorted."""
+    def rows(self, refs: Sequence[str], metrics: Collection[str] | None = None) -> list[Row]:
+        """All values of the runs, or those of some metrics; each metric and step once, sorted."""
         ...
 
     def file(self, ref: str, name: str, folder: Path) -> Path | None:
@@ -225,9 +225,10 @@ class MemoryTracker:
         self.shelf.append(run)
         return run
 
-    def rows(self, refs: Sequence[str]) -> list[Row]:
+    def rows(self, refs: Sequence[str], metrics: Collection[str] | None = None) -> list[Row]:
         """See `Tracker`."""
-        return sorted(row for run in self.shelf if run.ref in refs for row in run.values)
+        found = (row for run in self.shelf if run.ref in refs for row in run.values)
+        return sorted(row for row in found if metrics is None or row.metric in metrics)
 
     def file(self, ref: str, name: str, folder: Path) -> Path | None:
         """See `Tracker`."""

@@ -87,6 +87,16 @@ def test_points_that_were_never_logged_are_filled_in(opened: Open) -> None:
     assert logged_steps(tracker, run.ref, "train/loss") == [0, 8, 16, 24, 32]
 
 
+def test_some_metrics_are_read_alone(opened: Open) -> None:
+    tracker = opened()
+    run = tracker.start(CARD)
+    run.log([point(step, **{"eval/coverage": 1.0}) for step in (0, 8)])
+    wanted = {"eval/return", "train/loss", "none/such"}
+    assert tracker.rows([run.ref], wanted) == [row for row in tracker.rows([run.ref]) if row.metric in wanted]
+    assert [row.step for row in tracker.rows([run.ref], {"eval/return"})] == [0, 8]
+    assert tracker.rows([run.ref], set()) == []
+
+
 def test_runs_are_told_apart_by_arm_and_key(opened: Open) -> None:
     tracker = opened()
     cards = [CARD, CARD._replace(arm="none"), CARD._replace(spec_id="0ther"), CARD._replace(fingerprint="changed")]
@@ -239,6 +249,9 @@ def test_reading_at_once_and_through_the_client_agree(home: Path) -> None:
     refs = [run.ref for run in runs[:2]]
     assert sorted(tracker._rows_sqlite(refs)) == sorted(tracker._rows_client(refs)) == tracker.rows(refs)
     assert len(tracker.rows(refs)) == 2 * 3 * 5
+    some = {"eval/return", "eval/max"}
+    assert sorted(tracker._rows_sqlite(refs, some)) == sorted(tracker._rows_client(refs, some))
+    assert len(tracker.rows(refs, some)) == 2 * 2 * 5
 
 
 def test_a_server_is_asked_for_a_metric_of_many_runs_at_once(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
