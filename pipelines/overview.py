@@ -78,7 +78,7 @@ class Overview:
 
     def describe(self) -> None:
         """Refresh the description alone."""
-        self.tracker.publish(f"{self.study.note}\n\n{so_far(list(self.runs.values()))}", {})
+        self.tracker.publish(self._note(list(self.runs.values())), {})
 
     def publish(self) -> None:
         """Refresh the description, the figure and the table."""
@@ -87,7 +87,12 @@ class Overview:
         files = {TABLE: table(runs).encode()}
         if any(run.curve for run in runs):
             files[FIGURE] = figure(self.study, runs)
-        self.tracker.publish(f"{self.study.note}\n\n{so_far(runs)}", files)
+        self.tracker.publish(self._note(runs), files)
+
+    def _note(self, runs: Sequence[Run]) -> str:
+        """The question, what is known by now, and the rest of the study's own note."""
+        question, _, rest = self.study.note.partition("\n\n")
+        return f"{question}\n\n{so_far(runs)}\n\n{rest}".rstrip()
 
 
 def by_arm(runs: Iterable[Run]) -> dict[str, list[Run]]:

@@ -12,8 +12,8 @@ import torch
 from torch import Generator, Tensor
 
 from pipelines import policy
+from pipelines.animation import Panel, Scene, gif
 from pipelines.document import choices
-from pipelines.drawing import Panel, Scene, animation
 from pipelines.errors import InputError
 from pipelines.store import Home, StoreError
 from rhmc.envs import ENVS, EnvConfig
@@ -103,7 +103,7 @@ def episode_gif(saved: policy.Saved, episode: int = 0, beside: str | None = None
         raise InputError(f"the policy cannot be used: {error}") from error
     acts = {f"{saved.spec.algo.kind}, seed {saved.spec.seed}": trained(actor)} | others
     panels = [Panel(f"{name}, episode {episode}", play(env, act, episode)) for name, act in acts.items()]
-    return animation(env, panels, frames, MILLISECONDS)
+    return gif(env, panels, frames, MILLISECONDS)
 
 
 def render(what: str, out: Path, home: Home, episode: int = 0, beside: str | None = None, frames: int = FRAMES) -> Path:

@@ -281,7 +281,10 @@ def _status(study: Study, home: Home) -> tuple[dict[str, dict[str, int]], bool]:
     tracker = open_existing(study_card(study), home)
     recorded = tracker.recorded() if tracker else []
     plan = items(study, fingerprint(), "")
-    state = {(run.arm, run.key): run.status for run in recorded}
+    # Runs of a driver that was killed are logged as running; a log in this folder knows no other driver than one here.
+    own = tracker is not None and tracker.uri == f"sqlite:///{home.database}"
+    seen = {"running": "interrupted"} if own and not home.driven(study.name, study.profile) else {}
+    state = {(run.arm, run.key): seen.get(run.status, run.status) for run in recorded}
     planned = {(item.card.arm, item.key) for item in plan}
     stale = Counter(run.arm for run in recorded if (run.arm, run.key) not in planned)
     arms = {}

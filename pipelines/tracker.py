@@ -8,6 +8,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
+from types import MappingProxyType
 from typing import Literal, NamedTuple, Protocol
 
 from rhmc.types import Metrics
@@ -21,7 +22,8 @@ class StudyCard(NamedTuple):
     study: str
     profile: str
     note: str  # Markdown: question, arms, seeds, budget
-    params: tuple[str, ...] = ()  # names of what varies between its runs, and method and seed
+    params: Mapping[str, Sequence[str]] = MappingProxyType({})  # what varies, by method (arm of a search)
+    arms: Sequence[str] = ()
 
 
 class Card(NamedTuple):
@@ -56,6 +58,7 @@ class Recorded(NamedTuple):
     key: str
     status: Status
     commit: str
+    stale: bool = False  # marked as no part of the latest plan
 
 
 class Row(NamedTuple):
@@ -107,6 +110,10 @@ class Tracker(Protocol):
 
     def finished_anywhere(self, fingerprint: str) -> dict[str, str]:
         """Key -> ref of a finished run, of whatever study shares the log."""
+        ...
+
+    def mark(self, ref: str, *, stale: bool) -> None:
+        """Say of a run whether the latest plan is without it: then it stays, and views and averages pass over it."""
         ...
 
     def start(self, card: Card) -> RunLog:
@@ -208,7 +215,17 @@ class MemoryTracker:
 
     def recorded(self) -> list[Recorded]:
         """See `Tracker`."""
-        return [Recorded(r.ref, r.card.arm, r.card.key, r.status, r.card.commit) for r in self._mine()]
+        return [
+            Recorded(r.ref, r.card.arm, r.card.key, r.status, r.card.commit, "stale" in r.tags) for r in self._mine()
+        ]
+
+    def mark(self, ref: str, *, stale: bool) -> None:
+        """See `Tracker`."""
+        (run,) = (run for run in self.shelf if run.ref == ref)
+        if stale:
+            run.tags["stale"] = "yes"
+        else:
+            run.tags.pop("stale", None)
 
     def finished_anywhere(self, fingerprint: str) -> dict[str, str]:
         """See `Tracker`."""

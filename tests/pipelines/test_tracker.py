@@ -119,6 +119,16 @@ def test_the_status_is_kept_and_a_new_launch_reopens(opened: Open, status: str) 
     assert [run.status for run in tracker.recorded()] == ["interrupted"]
 
 
+def test_a_stale_run_is_marked_until_it_is_planned_again(opened: Open) -> None:
+    tracker = opened()
+    refs = [tracker.start(card).ref for card in (CARD, CARD._replace(spec_id="0ther"))]
+    assert [run.stale for run in tracker.recorded()] == [False, False]
+    tracker.mark(refs[0], stale=True)
+    assert [run.stale for run in opened().recorded()] == [True, False]
+    opened().mark(refs[0], stale=False)
+    assert [run.stale for run in opened().recorded()] == [False, False]
+
+
 def test_a_launch_leaves_other_studies_alone(opened: Open) -> None:
     opened(OTHER).start(CARD)
     tracker = opened()
@@ -169,8 +179,8 @@ def test_how_a_run_looks_in_mlflow(home: Path) -> None:
         "mlflow.parentRunId": tracker.parent,
     }
     assert run.data.tags.items() >= expected.items()
-    assert parent.data.tags["mlflow.note.content"] == "**Why?**"
-    assert tracker.client.get_experiment(run.info.experiment_id).tags["mlflow.note.content"] == "**Why?**"
+    assert parent.data.tags["mlflow.note.content"].startswith("**Why?** [Curves by arm](#/experiments/")
+    assert tracker.client.get_experiment(run.info.experiment_id).tags["mlflow.note.content"].startswith("**Why?** [")
     assert tracker.file(log.ref, "none.pt", home) is None
     (home / "copy").mkdir()
     kept = tracker.file(log.ref, "policy.pt", home / "copy")
