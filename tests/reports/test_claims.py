@@ -140,7 +140,7 @@ def sensors(ours: Sequence[float], theirs: Sequence[float]) -> Tables:
     parts = [
         study(
             "scaling",
-            {f"RHMC, {n}": noisy(x, 5), f"IQL, {n}": noisy(y, 5)},
+            {f"RHMC, {n} sensors": noisy(x, 5), f"IQL, {n} sensors": noisy(y, 5)},
             env=COVERAGE | {"agents": n},
             steps=PAPER,
         )
