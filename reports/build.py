@@ -15,7 +15,7 @@ from reports import comparison, page, scaling, tables
 from reports.canvas import save
 from reports.claims import VERDICTS, Claim
 from reports.frame import Results, TableError, load
-from reports.gallery import Picture, gallery, study_gallery
+from reports.gallery import Picture, gallery, in_short, study_gallery
 from reports.paper import Paper, read
 from reports.stats import FEW
 from reports.tables import Table, joined, steps
@@ -51,6 +51,8 @@ DEFINITIONS = (
 )
 
 
+FIRST = ("navigation", "coverage", "scaling", "ablation")  # studies of the paper, in its order
+MORE = ("profile_", "better_", "pairs_", "steadiness_")
 COMPLETE = "Nothing: every planned run is finished."
 DRAWN = "rhmc drawings"
 
@@ -65,6 +67,7 @@ class Report(NamedTuple):
     tables: dict[str, Table]
     claims: list[Claim]
     gaps: list[str]
+    short: list[str]  # what came out, a sentence a figure of the paper
 
 
 def build(runs: Path, out: Path, profile: str, study: str | None = None) -> list[Path]:
@@ -118,14 +121,15 @@ def _whole(results: Results, paper: Paper) -> Report:
     gaps += results.gaps(paper.arms | {scaling.STUDY: ()})
     title = f"Does it hold? The paper's results, profile {results.profile}"
     pictures, claims = gallery(results, paper), rules.judge(results, paper)
-    return Report(results, title, _lead(results), pictures, _tables(results, paper), claims, gaps)
+    made = _tables(results, paper)
+    return Report(results, title, _lead(results), pictures, made, claims, gaps, in_short(results, paper))
 
 
 def _single(results: Results, paper: Paper, study: str) -> Report:
     made = _study_tables(results, study) | {"runs": tables.runs(_alone(results))}
     title = f"Study {study}, profile {results.profile}"
     lead = f"{_question(results, study)} {_lead(results)}"
-    return Report(results, title, lead, study_gallery(results, paper, study), made, [], results.gaps({}))
+    return Report(results, title, lead, study_gallery(results, paper, study), made, [], results.gaps({}), [])
 
 
 def _write(report: Report, folder: Path) -> None:
@@ -187,6 +191,8 @@ def _index(report: Report) -> Iterator[str]:
     yield f"# {report.title}\n"
     yield "The same with everything in one page: `index.html`.\n"
     yield f"{_summary(results)}\n"
+    if report.short:
+        yield "\n".join(f"- {line}" for line in report.short) + "\n"
     if report.gaps:
         yield "Not everything is there yet: see [what is missing](#what-is-missing).\n"
     yield "## Figures\n"
@@ -228,6 +234,8 @@ def _content(report: Report, pictures: Path) -> Mapping[str, Any]:
     return {
         "title": report.title,
         "lead": report.lead,
+        "short": report.short,
+        "folded": page.FOLDED,
         "tally": page.verdicts(report.claims),
         "gaps": [gap.replace("`", "") for gap in report.gaps],
         "claims": [page.card(claim) for claim in report.claims],
@@ -250,8 +258,9 @@ def _first_seen(runs: Table) -> Iterator[tuple[str, bool]]:
 
 
 def _sections(report: Report, pictures: Path) -> list[page.Section]:
-    """The method and its tasks first, then a part per study, then what belongs to none."""
-    studies = report.results.studies
+    """The method and its tasks first, then a part per study, those of the paper first, then what belongs to none."""
+    others = [name for name in report.results.studies if name not in FIRST]
+    studies = [name for name in FIRST if name in report.results.studies] + others
     of_table = {name: study for study in studies for name in report.tables if name.endswith(f"_{study}")}
     of_table |= {name: "ablation" for name in ("table_2",) if name in report.tables}
     whole = [_section(report, pictures, "method", "The method and its tasks", "", ("table_1",))]
@@ -268,9 +277,17 @@ def _sections(report: Report, pictures: Path) -> list[page.Section]:
 def _section(report: Report, pictures: Path, name: str, title: str, study: str, names: Sequence[str]) -> page.Section:
     mine = [picture for picture in report.pictures if picture.study == study]
     made = rules.command(study, report.results.profile) if study in report.results.studies else DRAWN
-    plates = [page.plate(picture, pictures, made.partition(" && ")[0]) for picture in mine]
-    grids = [page.grid(key, report.tables[key]) for key in names if key in report.tables]
-    return page.Section(name, title, plates, grids)
+    plates = {p.name: page.plate(p, pictures, made.partition(" && ")[0]) for p in mine}
+    grids = {key: page.grid(key, report.tables[key]) for key in names if key in report.tables}
+    words = _question(report.results, study) if study in report.results.studies else ""
+    shown = [[x for key, x in found.items() if not _folded(key)] for found in (plates, grids)]
+    more = [[x for key, x in found.items() if _folded(key)] for found in (plates, grids)]
+    return page.Section(name, title, words, *shown, *more)
+
+
+def _folded(name: str) -> bool:
+    """Whether a figure or a table is folded away: what looks at the same runs in yet another way."""
+    return name.startswith(MORE) or name.endswith("_arms")
 
 
 def _heading(results: Results, study: str) -> str:

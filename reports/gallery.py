@@ -7,9 +7,10 @@ from reports import comparison, diagrams, figures, scaling, scenes
 from reports.canvas import Drawing
 from reports.frame import FINAL, Results
 from reports.paper import Curves, Paper
-from reports.tables import describe_task, joined, number
+from reports.tables import describe_task, joined, number, steps
 
 PAPERS = "fig_"
+OWN = ("RHMC", "full")  # the paper's method
 
 
 class Picture(NamedTuple):
@@ -38,6 +39,26 @@ def gallery(results: Results, paper: Paper) -> list[Picture]:
         drawn += _curves(results, spec, known.get(study, f"curves_{study}"))
     own = sorted((p for p in drawn if p.name.startswith(PAPERS)), key=lambda p: _order(p.name))
     return own + [p for p in drawn if not p.name.startswith(PAPERS)] + list(beyond(results))
+
+
+def in_short(results: Results, paper: Paper) -> list[str]:
+    """What came out, a sentence for each of the paper's comparisons that has runs."""
+    lines = []
+    for spec in paper.figures.values():
+        arms = comparison.compared(results, spec.study)
+        own = next((arm for arm in OWN if arm in arms), None)
+        if own is None or len(arms) < 2:
+            continue
+        first = arms[0] if arms[0] != own else arms[1]
+        side = "ahead of" if arms[0] == own else "behind"
+        values = [number(float(results.finals(spec.study, arm).mean())) for arm in (own, first)]
+        budget = results.budget(spec.study)
+        lines.append(
+            f"{spec.title.partition(':')[0]}, {steps(budget) if budget else 'unknown'} steps: {own} ends at {values[0]}, "
+            f"{arms.index(own) + 1} of {len(arms)} arms, {side} {first} at {values[1]}."
+            f"{_against_scripts(results, spec.study, {own: float(results.finals(spec.study, own).mean())})}"
+        )
+    return lines
 
 
 def study_gallery(results: Results, paper: Paper, study: str) -> list[Picture]:
@@ -140,7 +161,10 @@ def _states(results: Results) -> Iterator[Picture]:
     alt = "Two plots of agents and landmarks in the plane, before and after an episode."
     yield Picture("fig_5", "Cooperative navigation", caption, alt, scenes.navigation(found.navigation))
     seen = ", ".join(f"{scenes.covered(s)} of {len(s.targets)} with {s.agents}" for s in found.coverage)
-    caption = "Five targets and more and more sensors: see how sectors overlap, so that a sensor more adds ever less."
+    caption = (
+        "Five targets and more and more sensors, each case an episode of its own: see how far apart they stand, how "
+        "little a sector of 90 degrees takes in, and how sectors begin to overlap."
+    )
     alt = f"Plots of sensors with their sectors of view and targets. Targets seen: {seen} sensors."
     yield Picture(
         "fig_8", "Sensor coverage with different numbers of sensors", caption, alt, scenes.coverage(found.coverage)
