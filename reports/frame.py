@@ -93,13 +93,15 @@ class Results:
 
     def arms(self, study: str) -> list[str]:
         """Planned arms of a study in the order of `ORDER`; none if the study is not there."""
-        found = set(self.runs.loc[self.runs["study"] == study, "arm"])
+        found = set(self.plan(study)["arm"])
         return sorted(found, key=lambda arm: (ORDER.index(arm) if arm in ORDER else len(ORDER), arm))
 
     def plan(self, study: str, arm: str | None = None) -> pd.DataFrame:
         """Planned runs of a study or of one of its arms, by arm and seed."""
-        rows = self.runs[(self.runs["study"] == study) & (True if arm is None else self.runs["arm"] == arm)]
-        return rows.sort_values(["arm", "seed"], kind="stable")
+        if (study, arm) not in self._plans:
+            rows = self.runs[(self.runs["study"] == study) & (True if arm is None else self.runs["arm"] == arm)]
+            self._plans[study, arm] = rows.sort_values(["arm", "seed"], kind="stable")
+        return self._plans[study, arm]
 
     def finished(self, study: str, arm: str) -> pd.DataFrame:
         """Planned runs of an arm that are finished."""
@@ -108,9 +110,11 @@ class Results:
 
     def finals(self, study: str, arm: str, metric: str = FINAL) -> NDArray[np.float64]:
         """Final values of an arm's finished runs, by seed: (n,), empty if there are none."""
-        rows = self._select(study, metric)
-        keep = (rows["arm"] == arm) & rows["seed"].isin(self.finished(study, arm)["seed"])
-        return rows[keep].sort_values("seed")["value"].to_numpy(np.float64)
+        if (study, arm, metric) not in self._finals:
+            rows = self._select(study, metric)
+            keep = (rows["arm"] == arm) & rows["seed"].isin(self.finished(study, arm)["seed"])
+            self._finals[study, arm, metric] = rows[keep].sort_values("seed")["value"].to_numpy(np.float64)
+        return self._finals[study, arm, metric].copy()
 
     def curve(self, study: str, arm: str, metric: str = CURVE) -> pd.DataFrame:
         """Points of an arm's runs, unfinished ones included: columns seed, step, value."""
@@ -222,6 +226,14 @@ class Results:
     def _trainer(self, study: str, name: str) -> int | None:
         found = [_config(text).get("trainer", {}).get(name) for text in self.plan(study)["config"]]
         return max((int(x) for x in found if x is not None), default=None)
+
+    @cached_property
+    def _plans(self) -> dict[tuple[str, str | None], pd.DataFrame]:
+        return {}
+
+    @cached_property
+    def _finals(self) -> dict[tuple[str, str, str], NDArray[np.float64]]:
+        return {}
 
     @cached_property
     def _curves(self) -> dict[tuple[str, str, str], pd.DataFrame]:
