@@ -10,8 +10,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
+from reports import beyond, comparison, page, scaling, tables
 from reports import claims as rules
-from reports import comparison, page, scaling, tables
 from reports.canvas import save
 from reports.claims import VERDICTS, Claim
 from reports.frame import Results, TableError, load
@@ -52,7 +52,7 @@ DEFINITIONS = (
 
 
 FIRST = ("navigation", "coverage", "scaling", "ablation")  # studies of the paper, in its order
-MORE = ("profile_", "better_", "pairs_", "steadiness_")
+MORE = ("profile_", "better_", "pairs_", "steadiness_", "yardsticks")
 COMPLETE = "Nothing: every planned run is finished."
 DRAWN = "rhmc drawings"
 
@@ -161,8 +161,13 @@ def _tables(results: Results, paper: Paper) -> dict[str, Table]:
     for study in results.studies:
         made |= _study_tables(results, study)
     made |= {"yardsticks": tables.yardsticks(results)} if results.yardsticks else {}
-    shortfall = tables.theorem(results)
-    made |= {"theorem": shortfall} if shortfall else {}
+    every = {
+        "numbers": beyond.table_numbers(results),
+        "transfer": beyond.table_transfer(results),
+        "encoder": beyond.table_encoder(results),
+        "theorem": tables.theorem(results),
+    }
+    made |= {name: table for name, table in every.items() if table}
     return made | {"runs": tables.runs(results)}
 
 
@@ -174,6 +179,7 @@ def _study_tables(results: Results, study: str) -> dict[str, Table]:
         "final": tables.finals(results, study),
         "pairs": comparison.pairs_table(results, study),
         "efficiency": comparison.efficiency(results, study),
+        "assignments": beyond.table_assignments(results, study),
         "steadiness": steadiness if len(steadiness.shown) else None,
         "agents": scaling.table(results, found) if found else None,
     }
@@ -270,7 +276,9 @@ def _sections(report: Report, pictures: Path) -> list[page.Section]:
         for names in [tuple(name for name, owner in of_table.items() if owner == study)]
     ]
     rest = tuple(name for name in report.tables if name not in of_table and name not in ("table_1", "runs"))
-    whole.append(_section(report, pictures, "scale", "Scripted policies, bounds, Theorem 1", "-", rest))
+    whole.append(
+        _section(report, pictures, "scale", "Scripted policies, bounds, transfer, encoder, Theorem 1", "-", rest)
+    )
     return [section for section in whole if section.plates or section.grids]
 
 

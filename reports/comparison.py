@@ -145,7 +145,7 @@ def profile(results: Results, study: str) -> Drawing | None:
         figure = blank(9.0, 4.6)
         head(figure, f"Performance profile, study {study}", "share of seeds that end at or above a score")
         axes = figure.add_axes((0.075, 0.17, 0.6, 0.66))
-        for arm, share in shares.items():
+        for arm in shares:
             colour, dashes = look(arm, results.arms(study))
             words = f"{arm} ({len(values[arm])} seeds)"
             own = np.append(values[arm][:1], values[arm])  # drawn from its first seed to its last, lines apart

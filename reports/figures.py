@@ -89,7 +89,9 @@ def each_arm(results: Results, spec: Curves) -> Drawing | None:
     height = HEAD + 1.75 * rows + 0.75
     with styled():
         figure = blank(WIDTH, height)
-        words = "coloured: the arm named above; grey: all others. The axis is cut below what arms hold after the first rise"
+        words = (
+            "coloured: the arm named above; grey: all others. The axis is cut below what arms hold after the first rise"
+        )
         head(figure, f"{spec.title}, arm by arm", words)
         shared: Axes | None = None
         for n, arm in enumerate(curves):
@@ -112,7 +114,9 @@ def _held(curves: Mapping[str, pd.DataFrame]) -> tuple[float, float]:
     """Heights between which all means are once `RISE` of the budget is spent, with a margin."""
     last = max(float(rows["step"].max()) for rows in curves.values())
     late = [rows.loc[rows["step"] >= RISE * last, "mean"] for rows in curves.values()]
-    values = pd.concat([rows if len(rows) else curve["mean"] for rows, curve in zip(late, curves.values(), strict=True)])
+    values = pd.concat(
+        [rows if len(rows) else curve["mean"] for rows, curve in zip(late, curves.values(), strict=True)]
+    )
     margin = 0.12 * float(values.max() - values.min()) or 1.0
     return float(values.min()) - margin, float(values.max()) + margin
 
@@ -152,7 +156,9 @@ def footer(results: Results, spec: Curves, *, levels: bool = True) -> str:
     first += f"{'–'.join(map(str, counts))} {'seed' if counts == [1] else 'seeds'}"
     lines = f"lines: mean over seeds of greedy evaluation; band: 95 % bootstrap interval of the mean{few}"
     names = ["names: final return"]
-    names += ["dotted: the paper's values"] if levels and any(arm in spec.levels for arm in results.arms(spec.study)) else []
+    names += (
+        ["dotted: the paper's values"] if levels and any(arm in spec.levels for arm in results.arms(spec.study)) else []
+    )
     names += ["grey: scripted policies without learning, and bounds"] if levels and _rulers(results, spec) else []
     return f"{first}  ·  code {prints}\n{lines}\n{'; '.join(names)}"
 

@@ -180,7 +180,7 @@ def curve(points: pd.DataFrame) -> pd.DataFrame:
 
 
 def _means(table: pd.DataFrame, n: int) -> pd.DataFrame:
-    """`interval` of each column of a table (seeds x steps) in which n seeds are: all resamples of all of them at once."""
+    """`interval` of each column of a table (seeds x steps) with n seeds each, all columns at once."""
     x = np.array([table[step].dropna().to_numpy(np.float64) for step in table.columns]).T  # (n, k)
     found = pd.DataFrame({"step": table.columns, "mean": x.mean(0), "low": np.nan, "high": np.nan, "n": n})
     if n > 1:
