@@ -178,7 +178,9 @@ def fig_transfer(results: Results) -> Drawing | None:
             ]
         least = min(x.n for arms in found.values() for by in arms.values() for x in by.values())
         few = f" (fewer than {FEW} seeds: narrower than 95 %)" if least < FEW else ""
-        words = f"points: mean over seeds; bars: 95 % bootstrap interval{few}; upright line: as trained; grey: without"
+        words = (
+            f"points: mean over seeds; bars: 95 % bootstrap interval{few}; grey bar: as trained; grey lines: without"
+        )
         foot(figure, f"{words} learning, and a bound")
     columns = ["along", "kind", "name", "count", "value", "low", "high", "seeds"]
     return Drawing(figure, pd.DataFrame(rows, columns=columns))

@@ -53,8 +53,9 @@ DEFINITIONS = (
 
 FIRST = ("navigation", "coverage", "scaling", "ablation")  # studies of the paper, in its order
 MORE = ("profile_", "better_", "pairs_", "steadiness_", "yardsticks")
+LAST = ("provenance", "runs")  # tables with a part of their own at the end
 COMPLETE = "Nothing: every planned run is finished."
-DRAWN = "rhmc drawings"
+DRAWN, PLAYED = "rhmc drawings", "rhmc transfer"
 
 
 class Report(NamedTuple):
@@ -126,7 +127,8 @@ def _whole(results: Results, paper: Paper) -> Report:
 
 
 def _single(results: Results, paper: Paper, study: str) -> Report:
-    made = _study_tables(results, study) | {"runs": tables.runs(_alone(results))}
+    own = _alone(results)
+    made = _study_tables(results, study) | {"provenance": tables.provenance(own), "runs": tables.runs(own)}
     title = f"Study {study}, profile {results.profile}"
     lead = f"{_question(results, study)} {_lead(results)}"
     return Report(results, title, lead, study_gallery(results, paper, study), made, [], results.gaps({}), [])
@@ -168,7 +170,7 @@ def _tables(results: Results, paper: Paper) -> dict[str, Table]:
         "theorem": tables.theorem(results),
     }
     made |= {name: table for name, table in every.items() if table}
-    return made | {"runs": tables.runs(results)}
+    return made | {"provenance": tables.provenance(results), "runs": tables.runs(results)}
 
 
 def _study_tables(results: Results, study: str) -> dict[str, Table]:
@@ -213,7 +215,7 @@ def _index(report: Report) -> Iterator[str]:
         yield f"{_count(listed)} A rule computes each verdict: [claims.md](claims.md) prints it beside the runs used.\n"
         yield f"{listed.markdown()}\n"
     for name, table in report.tables.items():
-        if name != "runs":
+        if name not in LAST:
             yield f"## {table.title}\n"
             if table.note:
                 yield f"{table.note}\n"
@@ -225,6 +227,7 @@ def _index(report: Report) -> Iterator[str]:
     yield "\n".join(f"- {gap}" for gap in report.gaps) + "\n" if report.gaps else f"{COMPLETE}\n"
     yield "## Runs behind the numbers\n"
     yield f"{_origin(results)}\n"
+    yield f"{report.tables['provenance'].markdown()}\n"
     yield report.tables["runs"].markdown()
 
 
@@ -249,6 +252,7 @@ def _content(report: Report, pictures: Path) -> Mapping[str, Any]:
         "definitions": DEFINITIONS,
         "mixed": results.runs["fingerprint"].dropna().astype(str).replace("", None).nunique() > 1,
         "provenance": page.provenance(results),
+        "made": page.grid("provenance", report.tables["provenance"]),
         "runs": page.grid("runs", runs),
         "ids": [f"run-{run}" if first else "" for run, first in _first_seen(runs)],
         "foot": f"Built from the exported tables of profile {results.profile}; the same tables give the same page.",
@@ -267,7 +271,8 @@ def _sections(report: Report, pictures: Path) -> list[page.Section]:
     """The method and its tasks first, then a part per study, those of the paper first, then what belongs to none."""
     others = [name for name in report.results.studies if name not in FIRST]
     studies = [name for name in FIRST if name in report.results.studies] + others
-    of_table = {name: study for study in studies for name in report.tables if name.endswith(f"_{study}")}
+    shortest = sorted(studies, key=len)  # of `letter` and `coverage_letter` the longer one has the last word
+    of_table = {name: study for study in shortest for name in report.tables if name.endswith(f"_{study}")}
     of_table |= {name: "ablation" for name in ("table_2",) if name in report.tables}
     whole = [_section(report, pictures, "method", "The method and its tasks", "", ("table_1",))]
     whole += [
@@ -275,7 +280,7 @@ def _sections(report: Report, pictures: Path) -> list[page.Section]:
         for study in studies
         for names in [tuple(name for name, owner in of_table.items() if owner == study)]
     ]
-    rest = tuple(name for name in report.tables if name not in of_table and name not in ("table_1", "runs"))
+    rest = tuple(name for name in report.tables if name not in of_table and name not in ("table_1", *LAST))
     whole.append(
         _section(report, pictures, "scale", "Scripted policies, bounds, transfer, encoder, Theorem 1", "-", rest)
     )
@@ -284,8 +289,12 @@ def _sections(report: Report, pictures: Path) -> list[page.Section]:
 
 def _section(report: Report, pictures: Path, name: str, title: str, study: str, names: Sequence[str]) -> page.Section:
     mine = [picture for picture in report.pictures if picture.study == study]
-    made = rules.command(study, report.results.profile) if study in report.results.studies else DRAWN
+    made = PLAYED if study == "-" else DRAWN
+    made = rules.command(study, report.results.profile) if study in report.results.studies else made
     plates = {p.name: page.plate(p, pictures, made.partition(" && ")[0]) for p in mine}
+    if not study:
+        episodes = [page.episode(task, gif) for task, gif in report.results.episodes.items()]
+        plates |= {plate.name: plate for plate in episodes}
     grids = {key: page.grid(key, report.tables[key]) for key in names if key in report.tables}
     words = _question(report.results, study) if study in report.results.studies else ""
     shown = [[x for key, x in found.items() if not _folded(key)] for found in (plates, grids)]

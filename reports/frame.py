@@ -39,6 +39,7 @@ TOLD = ("machine", "versions")  # of a run, where they are exported
 METHOD = ("kind", "name", "source", "family", "training", "execution", "critic", "coordination")
 STATUSES = ("finished", "partial", "missing")
 METHODS = "methods.json"  # what the methods are
+EPISODES = "episode_*.gif"  # animations, one a task
 YARDSTICKS, THEOREM = "yardsticks", "theorem"  # tables that are no studies
 MOVED = "transfer"  # the table of trained policies with other numbers of agents and targets
 PLAYED = ("study", "arm", "seed", "run", "task", "agents", "targets", "trained_agents", "trained_targets", "value")
@@ -83,6 +84,7 @@ class Results:
         scenes: what Figures 4, 5 and 8 show.
         moved: trained policies with other numbers of agents and targets: columns `PLAYED`.
         notes: what was left out of the tables, in sentences.
+        episodes: an animation of an episode by task, as a GIF.
     """
 
     points: pd.DataFrame
@@ -93,6 +95,7 @@ class Results:
     scenes: Scenes | None = None
     moved: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=list(PLAYED)))
     notes: tuple[str, ...] = ()
+    episodes: Mapping[str, bytes] = field(default_factory=dict)
 
     @property
     def studies(self) -> list[str]:
@@ -288,7 +291,9 @@ def load(folder: Path, profile: str, only: str | None = None) -> Results:
         joined = {part: _join(found, FORMS[part]) for part, found in tables.items()}
         watched, moved, notes = _of_plan(joined)
         points = _join([joined["points"], watched], POINTS)
-        results = Results(points, joined["runs"], profile, *(drawn if only is None else ((), (), None)), moved, notes)
+        gifs = {path.stem.partition("_")[2]: path.read_bytes() for path in sorted(folder.glob(EPISODES))}
+        shown = (drawn, gifs) if only is None else (((), (), None), {})
+        results = Results(points, joined["runs"], profile, *shown[0], moved, notes, shown[1])
         faults = [*_plan_faults(results), *_point_faults(results)]
         if not faults:
             return results

@@ -18,6 +18,12 @@ TEMPLATE = "page.html.j2"
 NUMBER = re.compile(r"^[+<\s]*(-?\d[\d,]*(?:\.\d+)?)\s*([kM]?)\b")
 SHOWN = 2 / 3  # of a figure's pixels: all words on the page are then of one size
 FOLDED = 6  # quantities of a claim that are shown at once
+EPISODE_WORDS: Mapping[str, str] = {
+    "coverage": "Left a trained policy, its lines what its coordinator assigns; then each sensor seeking its own best "
+    "window; right any headings at will, the bound. Green: a target in sight; red ring: unseen.",
+    "navigation": "Left a trained policy; then each agent steering for its nearest landmark; right for the one that a "
+    "matching gives it. Green: a landmark with an agent on it.",
+}
 UNITS = {"": 1.0, "k": 1e3, "M": 1e6}
 MARKS: Mapping[str, str] = {  # a sign for each verdict, beside its colour
     "reproduced": "✓",
@@ -97,6 +103,14 @@ def plate(picture: Picture, folder: Path, behind: str) -> Plate:
     return Plate(*about, width, height, round(width * SHOWN), behind, files)
 
 
+def episode(task: str, gif: bytes) -> Plate:
+    """An animation from what `rhmc render` wrote."""
+    width, height = int.from_bytes(gif[6:8], "little"), int.from_bytes(gif[8:10], "little")  # of the GIF's header
+    words = EPISODE_WORDS.get(task, "A trained policy, and others in the same episode.")
+    about = (f"episode_{task}", f"An episode of {task}", words, words, "gif", b64encode(gif).decode())
+    return Plate(*about, width, height, width, "rhmc render", [("GIF", f"runs/episode_{task}.gif")])
+
+
 def grid(name: str, table: Table, *, files: bool = True) -> Grid:
     """A table, every cell with what it is sorted by."""
     columns = [str(column) for column in table.shown.columns]
@@ -141,11 +155,9 @@ def card(claim: Claim) -> dict[str, Any]:
 def provenance(results: Results) -> list[tuple[str, str]]:
     """What made the runs: names and values."""
     runs = results.runs
-    known = {name: sorted(set(runs[name].dropna().astype(str)) - {""}) for name in ("fingerprint", "commit")}
+    known = sorted(set(runs["fingerprint"].dropna().astype(str)) - {""})
     seconds = float(runs["seconds"].fillna(0).sum())
-    found = [("Profile", results.profile)]
-    found += [("Code fingerprint", ", ".join(known["fingerprint"]) or "unknown")]
-    found += [("Commit", ", ".join(known["commit"]) or "unknown")]
+    found = [("Profile", results.profile), ("Code fingerprint", ", ".join(known) or "unknown")]
     for name in TOLD:
         values = sorted(set(runs[name].dropna().astype(str)) - {""}) if name in runs else []
         found.append((name.capitalize(), "; ".join(values) or "not exported"))

@@ -7,7 +7,10 @@ from typing import Annotated
 import typer
 
 WHAT = "A finished run, by its id in MLflow; or policy.pt, a checkpoint, or a folder with one."
-BESIDE = "Also a policy without learning in the same episode: best_window, planner, nearest, matching, ..."
+BESIDE = (
+    "Also policies without learning in the same episode, with commas between: best_window, planner, nearest, matching, "
+    "...; free_heading_bound shows what any headings could see."
+)
 
 
 def render(

@@ -144,7 +144,7 @@ def test_a_half_finished_study_says_so(made: Path, read: Reader) -> None:
 
 
 def test_what_made_the_runs(read: Reader) -> None:
-    for words in ("Code fingerprint 0123456789ab", "Commit c0ffee", "Machine not exported", "Processor time"):
+    for words in ("Code fingerprint 0123456789ab", " c0ffee ", "Machine not exported", "Processor time of all runs"):
         assert words in read.text
     assert "not all made by the same code" not in read.text
 
