@@ -134,8 +134,15 @@ def episode_gif(saved: policy.Saved, episode: int = 0, beside: str | None = None
     return animation(env, [Panel(own, play(env, trained(actor), episode)), *others], frames, MILLISECONDS)
 
 
-def render(what: str, out: Path, home: Home, episode: int = 0, beside: str | None = None, frames: int = FRAMES) -> Path:
-    """Write the animation of a run, by its id in MLflow, or of a checkpoint, by its path.
+def render(
+    what: str | policy.Saved,
+    out: Path,
+    home: Home,
+    episode: int = 0,
+    beside: str | None = None,
+    frames: int = FRAMES,
+) -> Path:
+    """Write the animation of a policy, of a run, by its id in MLflow, or of a checkpoint, by its path.
 
     Raises:
         InputError: what is given cannot be used; nothing is written.
@@ -143,15 +150,18 @@ def render(what: str, out: Path, home: Home, episode: int = 0, beside: str | Non
     """
     if out.is_dir() or not out.parent.is_dir():
         raise InputError(f"--out: {out} is a folder" if out.is_dir() else f"--out: {out.parent} is no folder")
-    path = Path(what)
-    if path.exists() or not RUN.fullmatch(what):
-        saved = policy.load(path)
-    else:
-        with TemporaryDirectory() as folder:
-            saved = policy.load(_fetch(what, home, Path(folder)))
+    saved = what if isinstance(what, policy.Saved) else _saved(what, home)
     torch.set_num_threads(saved.spec.trainer.threads)  # the actions of larger layers depend on it
     write(out, episode_gif(saved, episode, beside, frames))
     return out
+
+
+def _saved(what: str, home: Home) -> policy.Saved:
+    path = Path(what)
+    if path.exists() or not RUN.fullmatch(what):
+        return policy.load(path)
+    with TemporaryDirectory() as folder:
+        return policy.load(_fetch(what, home, Path(folder)))
 
 
 def _fetch(ref: str, home: Home, folder: Path) -> Path:

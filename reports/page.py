@@ -108,7 +108,7 @@ def episode(task: str, gif: bytes) -> Plate:
     width, height = int.from_bytes(gif[6:8], "little"), int.from_bytes(gif[8:10], "little")  # of the GIF's header
     words = EPISODE_WORDS.get(task, "A trained policy, and others in the same episode.")
     about = (f"episode_{task}", f"An episode of {task}", words, words, "gif", b64encode(gif).decode())
-    return Plate(*about, width, height, width, "rhmc render", [("GIF", f"runs/episode_{task}.gif")])
+    return Plate(*about, width, height, width, "rhmc render", [])
 
 
 def grid(name: str, table: Table, *, files: bool = True) -> Grid:
