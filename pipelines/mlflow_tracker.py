@@ -21,6 +21,7 @@ from filelock import FileLock
 
 from pipelines import names, views
 from pipelines.errors import InputError
+from pipelines.host import Host
 from pipelines.store import Home, StoreError, one_line, replace_durably, sync
 from pipelines.tracker import Card, Recorded, Row, Status, StudyCard, unseen
 from rhmc.types import Metrics
@@ -198,7 +199,7 @@ class MlflowTracker:
             "spec": card.spec_id,
             "fingerprint": card.fingerprint,
             "commit": card.commit,
-        }
+        } | {name: value for name, value in card.host._asdict().items() if value}
 
     def rows(self, refs: Sequence[str]) -> list[Row]:
         """See `Tracker`. One query where the store is SQLite, else a request per run and metric."""
@@ -420,7 +421,8 @@ def open_existing(study: StudyCard, home: Home) -> MlflowTracker | None:
 def _recorded(run: Run) -> Recorded:
     tags: dict[str, str] = defaultdict(str, run.data.tags)
     key = f"{tags['spec']}-{tags['fingerprint']}"
-    return Recorded(run.info.run_id, tags["variant"], key, FROM_MLFLOW[run.info.status], tags["commit"])
+    host = Host(tags["machine"], tags["versions"])
+    return Recorded(run.info.run_id, tags["variant"], key, FROM_MLFLOW[run.info.status], tags["commit"], host)
 
 
 # What may be in the way

@@ -10,6 +10,7 @@ from itertools import count
 from pathlib import Path
 from typing import Literal, NamedTuple, Protocol
 
+from pipelines.host import Host
 from rhmc.types import Metrics
 
 Status = Literal["running", "finished", "failed", "interrupted"]
@@ -36,6 +37,7 @@ class Card(NamedTuple):
     commit: str
     params: dict[str, str]  # what varies between the runs of the study, and method and seed
     trial: int | None = None  # of a search: then the run stands for all of its seeds
+    host: Host = Host()  # that starts it
 
     @property
     def key(self) -> str:
@@ -56,6 +58,7 @@ class Recorded(NamedTuple):
     key: str
     status: Status
     commit: str
+    host: Host = Host()
 
 
 class Row(NamedTuple):
@@ -208,7 +211,7 @@ class MemoryTracker:
 
     def recorded(self) -> list[Recorded]:
         """See `Tracker`."""
-        return [Recorded(r.ref, r.card.arm, r.card.key, r.status, r.card.commit) for r in self._mine()]
+        return [Recorded(r.ref, r.card.arm, r.card.key, r.status, r.card.commit, r.card.host) for r in self._mine()]
 
     def finished_anywhere(self, fingerprint: str) -> dict[str, str]:
         """See `Tracker`."""
