@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from reports import beyond, comparison, page, scaling, tables
 from reports import claims as rules
@@ -51,6 +51,7 @@ DEFINITIONS = (
 )
 
 
+Part = TypeVar("Part")
 FIRST = ("navigation", "coverage", "scaling", "ablation")  # studies of the paper, in its order
 MORE = ("profile_", "better_", "pairs_", "steadiness_", "yardsticks")
 LAST = ("provenance", "runs")  # tables with a part of their own at the end
@@ -297,9 +298,13 @@ def _section(report: Report, pictures: Path, name: str, title: str, study: str, 
         plates |= {plate.name: plate for plate in episodes}
     grids = {key: page.grid(key, report.tables[key]) for key in names if key in report.tables}
     words = _question(report.results, study) if study in report.results.studies else ""
-    shown = [[x for key, x in found.items() if not _folded(key)] for found in (plates, grids)]
-    more = [[x for key, x in found.items() if _folded(key)] for found in (plates, grids)]
-    return page.Section(name, title, words, *shown, *more)
+    return page.Section(name, title, words, *_parted(plates), *_parted(grids))
+
+
+def _parted(found: Mapping[str, Part]) -> tuple[list[Part], list[Part]]:
+    """What is shown at once, and what is folded away."""
+    shown = [x for key, x in found.items() if not _folded(key)]
+    return shown, [x for key, x in found.items() if _folded(key)]
 
 
 def _folded(name: str) -> bool:

@@ -7,7 +7,7 @@ planned run). What is wrong in them is an error of one line per fault; what is n
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -292,8 +292,10 @@ def load(folder: Path, profile: str, only: str | None = None) -> Results:
         watched, moved, notes = _of_plan(joined)
         points = _join([joined["points"], watched], POINTS)
         gifs = {path.stem.partition("_")[2]: path.read_bytes() for path in sorted(folder.glob(EPISODES))}
-        shown = (drawn, gifs) if only is None else (((), (), None), {})
-        results = Results(points, joined["runs"], profile, *shown[0], moved, notes, shown[1])
+        results = Results(points, joined["runs"], profile, moved=moved, notes=notes)
+        if only is None:
+            methods, modules, scenes = drawn
+            results = replace(results, methods=methods, modules=modules, scenes=scenes, episodes=gifs)
         faults = [*_plan_faults(results), *_point_faults(results)]
         if not faults:
             return results

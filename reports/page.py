@@ -75,8 +75,8 @@ class Section(NamedTuple):
     title: str
     words: str
     plates: list[Plate]
-    grids: list[Grid]
     more_plates: list[Plate]
+    grids: list[Grid]
     more_grids: list[Grid]
 
     @property
