@@ -23,6 +23,7 @@ from filelock import FileLock
 
 from pipelines import legend, names, views
 from pipelines.errors import InputError
+from pipelines.host import Host
 from pipelines.store import Home, StoreError, one_line, replace_durably, sync, without_password
 from pipelines.tracker import Card, Recorded, Row, Status, StudyCard, unseen
 from rhmc.types import Metrics
@@ -230,17 +231,21 @@ class MlflowTracker:
         return MlflowRun(self, card, ref, seen)
 
     def _tags(self, card: Card) -> dict[str, str]:
-        return dict(self._look(card.arm, self.arms)) | {
-            "role": "run",
-            "mlflow.parentRunId": self.parent or "",
-            "variant": card.arm,
-            "algorithm": card.algorithm,
-            "task": card.task,
-            "seed": str(card.seed),
-            "spec": card.spec_id,
-            "fingerprint": card.fingerprint,
-            "commit": card.commit,
-        }
+        return (
+            dict(self._look(card.arm, self.arms))
+            | {
+                "role": "run",
+                "mlflow.parentRunId": self.parent or "",
+                "variant": card.arm,
+                "algorithm": card.algorithm,
+                "task": card.task,
+                "seed": str(card.seed),
+                "spec": card.spec_id,
+                "fingerprint": card.fingerprint,
+                "commit": card.commit,
+            }
+            | {name: value for name, value in card.host._asdict().items() if value}
+        )
 
     def rows(self, refs: Sequence[str], metrics: Collection[str] | None = None) -> list[Row]:
         """See `Tracker`. SQLite: a query per run; otherwise a request per metric and a hundred runs."""
@@ -489,8 +494,8 @@ def open_existing(study: StudyCard, home: Home) -> MlflowTracker | None:
 def _recorded(run: Run) -> Recorded:
     tags: dict[str, str] = defaultdict(str, run.data.tags)
     key = f"{tags['spec']}-{tags['fingerprint']}"
-    status = FROM_MLFLOW[run.info.status]
-    return Recorded(run.info.run_id, tags["variant"], key, status, tags["commit"], views.STALE in tags)
+    status, host = FROM_MLFLOW[run.info.status], Host(tags["machine"], tags["versions"])
+    return Recorded(run.info.run_id, tags["variant"], key, status, tags["commit"], views.STALE in tags, host)
 
 
 # What may be in the way

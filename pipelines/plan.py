@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedSeq
 
+from pipelines.host import Host
 from pipelines.study import RunSpec, Study, changes
 from pipelines.tracker import Card, Recorded, StudyCard
 
@@ -35,8 +36,8 @@ class Item(NamedTuple):
         return self.card.key
 
 
-def items(study: Study, fingerprint: str, commit: str) -> list[Item]:
-    """The runs of a study, in its order."""
+def items(study: Study, fingerprint: str, commit: str, where: Host | None = None) -> list[Item]:
+    """The runs of a study, in its order. where: what starts them, for those that are about to be."""
     runs = study.runs()
     varying = what_varies([run.spec for run in runs])
     planned = []
@@ -45,7 +46,7 @@ def items(study: Study, fingerprint: str, commit: str) -> list[Item]:
         algorithm, task = spec.algo.kind, spec.env.kind
         params = {"method": algorithm} | {name: str(flat[name]) for name in varying if name in flat and name != KIND}
         params |= {"seed": str(spec.seed)}
-        card = Card(run.arm, spec.seed, spec.id, fingerprint, algorithm, task, commit, params)
+        card = Card(run.arm, spec.seed, spec.id, fingerprint, algorithm, task, commit, params, host=where or Host())
         planned.append(Item(card, spec, study.name))
     return planned
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Self
 from rich.console import Console
 
 from pipelines.fingerprint import fingerprint
+from pipelines.host import host
 from pipelines.plan import Item, commit, finished, items, study_card
 from pipelines.progress import Board, board, print_table
 from pipelines.recorder import Recorder
@@ -135,7 +136,7 @@ def _launch(study: Study, home: Home, interrupts: Interrupts) -> int:
     tracker = MlflowTracker(card, home)
     status: Status = "interrupted"
     try:
-        plan = items(study, fingerprint(), commit())
+        plan = items(study, fingerprint(), commit(), host())
         with board(Console()) as display:
             recorder = Recorder(card, plan, tracker, home, display)
             if recorder.skipped:

@@ -11,6 +11,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Literal, NamedTuple, Protocol
 
+from pipelines.host import Host
 from rhmc.types import Metrics
 
 Status = Literal["running", "finished", "failed", "interrupted"]
@@ -38,6 +39,7 @@ class Card(NamedTuple):
     commit: str
     params: dict[str, str]  # what varies between the runs of the study, and method and seed
     trial: int | None = None  # of a search: then the run stands for all of its seeds
+    host: Host = Host()  # that starts it
 
     @property
     def key(self) -> str:
@@ -59,6 +61,7 @@ class Recorded(NamedTuple):
     status: Status
     commit: str
     stale: bool = False  # marked as no part of the latest plan
+    host: Host = Host()
 
 
 class Row(NamedTuple):
@@ -216,7 +219,8 @@ class MemoryTracker:
     def recorded(self) -> list[Recorded]:
         """See `Tracker`."""
         return [
-            Recorded(r.ref, r.card.arm, r.card.key, r.status, r.card.commit, "stale" in r.tags) for r in self._mine()
+            Recorded(r.ref, r.card.arm, r.card.key, r.status, r.card.commit, "stale" in r.tags, r.card.host)
+            for r in self._mine()
         ]
 
     def mark(self, ref: str, *, stale: bool) -> None:

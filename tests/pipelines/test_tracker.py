@@ -13,6 +13,7 @@ import pytest
 from mlflow import MlflowClient
 
 from pipelines import histories, mlflow_tracker
+from pipelines.host import Host
 from pipelines.mlflow_tracker import MlflowTracker, open_existing
 from pipelines.names import shown
 from pipelines.store import Home, StoreError, without_password
@@ -179,6 +180,9 @@ def test_how_a_run_looks_in_mlflow(home: Path) -> None:
         "mlflow.parentRunId": tracker.parent,
     }
     assert run.data.tags.items() >= expected.items()
+    assert "machine" not in run.data.tags  # not known: no empty word
+    tracker.start(CARD._replace(spec_id="other", host=Host("a machine", "torch 2"))).finish("finished")
+    assert {run.key: run.host for run in tracker.recorded()}["other-c0de"] == ("a machine", "torch 2")
     assert parent.data.tags["mlflow.note.content"].startswith("**Why?** [Curves by arm](#/experiments/")
     assert tracker.client.get_experiment(run.info.experiment_id).tags["mlflow.note.content"].startswith("**Why?** [")
     assert tracker.file(log.ref, "none.pt", home) is None
