@@ -10,9 +10,11 @@ from typing import Any, NamedTuple
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedSeq
 
+from pipelines.host import Host
 from pipelines.study import RunSpec, Study, changes
 from pipelines.tracker import Card, Recorded, StudyCard
 
+LISTED = 25  # arms that a description names: MLflow keeps 8,000 characters of one
 KIND = "algo.kind"  # which is what the param `method` says
 
 
@@ -34,8 +36,8 @@ class Item(NamedTuple):
         return self.card.key
 
 
-def items(study: Study, fingerprint: str, commit: str) -> list[Item]:
-    """The runs of a study, in its order."""
+def items(study: Study, fingerprint: str, commit: str, where: Host | None = None) -> list[Item]:
+    """The runs of a study, in its order. where: what starts them, for those that are about to be."""
     runs = study.runs()
     varying = what_varies([run.spec for run in runs])
     planned = []
@@ -44,7 +46,7 @@ def items(study: Study, fingerprint: str, commit: str) -> list[Item]:
         algorithm, task = spec.algo.kind, spec.env.kind
         params = {"method": algorithm} | {name: str(flat[name]) for name in varying if name in flat and name != KIND}
         params |= {"seed": str(spec.seed)}
-        card = Card(run.arm, spec.seed, spec.id, fingerprint, algorithm, task, commit, params)
+        card = Card(run.arm, spec.seed, spec.id, fingerprint, algorithm, task, commit, params, host=where or Host())
         planned.append(Item(card, spec, study.name))
     return planned
 
@@ -77,7 +79,7 @@ def study_card(study: Study) -> StudyCard:
     note = (
         f"{study.question}\n\n"
         f"Profile `{study.profile}`: {len(arms)} arms × {len(seeds)} seeds, {budget} environment steps each.\n\n"
-        + "\n".join(f"- **{arm}**: {_differs(study, arm)}" for arm in arms)
+        + "\n".join([*(f"- **{arm}**: {_differs(study, arm)}" for arm in arms[:LISTED]), *more(arms)])
     )
     return StudyCard(study.name, study.profile, note, _varying([run.spec for run in runs]), arms)
 
@@ -87,6 +89,11 @@ def _varying(specs: Sequence[RunSpec]) -> dict[str, list[str]]:
     names = [name for name in what_varies(specs) if name != KIND]
     flats = {spec.algo.kind: flatten(spec.model_dump(mode="json")) for spec in specs}
     return {method: [name for name in names if name in flat] for method, flat in flats.items()}
+
+
+def more(arms: Sequence[str]) -> list[str]:
+    """The line of a description that stands for the arms that are not listed, if any."""
+    return [f"\n{len(arms) - LISTED:,} more arms are not listed here."] if len(arms) > LISTED else []
 
 
 def _differs(study: Study, arm: str) -> str:

@@ -36,14 +36,15 @@ class Recorder:
         self.arms: dict[str, str] = {}  # of the runs that were started, by key
         self.failures: dict[str, str] = {}  # name of the run -> one line
         self.waiting: dict[str, list[Item]] = defaultdict(list)
-        self.busy = False  # whether another process was training one of them
+        self.places: dict[str, list[str]] = defaultdict(list)  # key -> the nodes that trained it in this launch
+        self.busy = False  # whether one of them was out of reach, and may be trained by now
         recorded = tracker.recorded()
         done = finished(recorded)
         for item in plan:
             if (item.card.arm, item.key) not in done:
                 self.waiting[item.key].append(item)
         self.skipped = len(plan) - self.left
-        self.overview = Overview(study, plan, tracker)
+        self.overview = Overview(study, plan, tracker, recorded)
         self.overview.describe()
         self._set_aside(recorded)
         self._tidy()
@@ -146,9 +147,21 @@ class Recorder:
         self._copy(log.ref, items[1:])
         Checkpoints(folder).clear()
 
+    def placed(self, key: str, node: str) -> None:
+        """A training goes on at a node of a cluster."""
+        self.places[key].append(node)
+        self.logs[key].tag("nodes", ", ".join(self.places[key]))
+
     def died(self, key: str) -> None:
         """The process that did a training is gone; another one will continue it."""
         self.board.end(self.waiting[key][0].name, "its worker died; another one continues it")
+
+    def lost(self, key: str) -> None:
+        """As `died`, but none will continue it before all others have ended."""
+        if key in self.logs:
+            self._end(key, "interrupted")
+        self.busy = True
+        self.board.end(self.waiting[key][0].name, "its node died; it is continued later")
 
     def failed(self, key: str, error: str, trace: str) -> None:
         """A training failed: keep why, go on with the others."""

@@ -3,6 +3,7 @@
 import hashlib
 import os
 import shutil
+import urllib.parse
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -241,6 +242,15 @@ KEPT: dict[frozenset[str], Callable[[], State]] = {  # what learning keeps, by i
     frozenset(("rows",)): lambda: {"rows": []},
     frozenset(("rows", "count")): lambda: {"rows": {}, "count": torch.zeros(0, dtype=torch.int64)},
 }
+
+
+def without_password(uri: str) -> str:
+    """An address as it may be shown."""
+    try:
+        password = urllib.parse.urlsplit(uri).password
+    except ValueError:  # brackets that hold no address
+        return uri
+    return uri.replace(f":{password}@", ":***@", 1) if password else uri
 
 
 def one_line(error: BaseException) -> str:

@@ -4,13 +4,14 @@ A run in a log is named by study, profile, arm and key (spec id and code fingerp
 already continues it. A point that is logged already is not logged again.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
 from types import MappingProxyType
 from typing import Literal, NamedTuple, Protocol
 
+from pipelines.host import Host
 from rhmc.types import Metrics
 
 Status = Literal["running", "finished", "failed", "interrupted"]
@@ -38,6 +39,7 @@ class Card(NamedTuple):
     commit: str
     params: dict[str, str]  # what varies between the runs of the study, and method and seed
     trial: int | None = None  # of a search: then the run stands for all of its seeds
+    host: Host = Host()  # that starts it
 
     @property
     def key(self) -> str:
@@ -59,6 +61,7 @@ class Recorded(NamedTuple):
     status: Status
     commit: str
     stale: bool = False  # marked as no part of the latest plan
+    host: Host = Host()
 
 
 class Row(NamedTuple):
@@ -120,8 +123,8 @@ class Tracker(Protocol):
         """Begin a run, or continue it."""
         ...
 
-    def rows(self, refs: Sequence[str]) -> list[Row]:
-        """All values of the runs, each metric and step once, sorted."""
+    def rows(self, refs: Sequence[str], metrics: Collection[str] | None = None) -> list[Row]:
+        """All values of the runs, or those of some metrics; each metric and step once, sorted."""
         ...
 
     def file(self, ref: str, name: str, folder: Path) -> Path | None:
@@ -216,7 +219,8 @@ class MemoryTracker:
     def recorded(self) -> list[Recorded]:
         """See `Tracker`."""
         return [
-            Recorded(r.ref, r.card.arm, r.card.key, r.status, r.card.commit, "stale" in r.tags) for r in self._mine()
+            Recorded(r.ref, r.card.arm, r.card.key, r.status, r.card.commit, "stale" in r.tags, r.card.host)
+            for r in self._mine()
         ]
 
     def mark(self, ref: str, *, stale: bool) -> None:
@@ -242,9 +246,10 @@ class MemoryTracker:
         self.shelf.append(run)
         return run
 
-    def rows(self, refs: Sequence[str]) -> list[Row]:
+    def rows(self, refs: Sequence[str], metrics: Collection[str] | None = None) -> list[Row]:
         """See `Tracker`."""
-        return sorted(row for run in self.shelf if run.ref in refs for row in run.values)
+        found = (row for run in self.shelf if run.ref in refs for row in run.values)
+        return sorted(row for row in found if metrics is None or row.metric in metrics)
 
     def file(self, ref: str, name: str, folder: Path) -> Path | None:
         """See `Tracker`."""

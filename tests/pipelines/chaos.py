@@ -209,7 +209,7 @@ def _drive(study: str, home: str, uri: str | None, length: int, room: int | None
         os.environ["MLFLOW_TRACKING_URI"] = uri
     os.environ["MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR"] = "0"  # at most a second between two tries
     run.fingerprint = lambda: CODE
-    ray_driver.ray_session = lambda *args: nullcontext()
+    ray_driver.ray_session = lambda *args: nullcontext([])
     ray_driver.fit = fit_here
     fuse = Fuse(length)
     fuse.lay(home)
@@ -326,10 +326,10 @@ def damage(home: Path, rng: random.Random) -> str:
 
 def damaged(content: bytes, kind: str, rng: random.Random) -> bytes:
     """The content after a damage of `DAMAGES`."""
+    if kind == "empty" or not content:  # emptied before, and nobody has looked since
+        return b""
     if kind == "cut short":
         return content[: rng.randrange(len(content))]
-    if kind == "empty":
-        return b""
     if kind == "noise":
         return rng.randbytes(len(content))
     size = min(512, len(content))

@@ -18,6 +18,7 @@ from pipelines.study import RunSpec
 from pipelines.trainable import RunTrainable
 from rhmc.envs import coverage, navigation
 from rhmc.evaluate import evaluate
+from rhmc.scripted import BOUNDS
 from rhmc.trainer import Trainer
 from tests.pipelines.test_policy import run
 from tests.pipelines.test_trainable import finish, job, same
@@ -53,6 +54,20 @@ def test_two_policies_meet_the_same_targets() -> None:
     assert not torch.equal(one[-1].state.heading, other[-1].state.heading)
     third = render.play(env, render.scripted(env, "best_window", 4), 4)
     assert not torch.equal(third[0].state.targets, other[0].state.targets)
+
+
+def test_any_headings_see_what_the_bound_says() -> None:
+    env = coverage.Config(agents=2, targets=4)
+    free = render.panel(env, render.FREE, 5)
+    other = render.play(env, render.scripted(env, "best_window", 5), 5)
+    assert all(torch.equal(a.state.targets, b.state.targets) for a, b in zip(free, other, strict=True))
+    bound = [float(BOUNDS["coverage"][render.FREE](env, scene.state)) for scene in free[1:]]
+    assert free[-1].text.endswith(f"coverage so far {100 * sum(bound) / len(bound):.1f} %")
+    for scene, value in zip(free[1:], bound, strict=True):
+        seen = coverage.visible(*coverage.relation(scene.state))[0].any(0).float().mean()
+        assert float(seen) == pytest.approx(value)
+    with pytest.raises(InputError, match="'free_heading_bound' is not allowed; allowed: random, hold"):
+        render.panel(navigation.Config(agents=2), render.FREE, 5)
 
 
 # Pictures
@@ -126,6 +141,8 @@ def test_a_run_keeps_less_than_300_kb() -> None:
     assert gif == render.episode_gif(saved(one), frames=30)
     assert frames(gif)[0].size == (animation.SIDE, animation.SIDE + animation.LINES)
     assert frames(render.episode_gif(saved(one), beside="hold", frames=2))[0].width == 2 * animation.SIDE
+    both = f"hold,{render.FREE}"
+    assert frames(render.episode_gif(saved(one), beside=both, frames=2))[0].width == 3 * animation.SIDE
 
 
 # In a run

@@ -4,7 +4,6 @@ import io
 import json
 import os
 import signal
-import socket
 import sys
 import threading
 from collections.abc import Callable
@@ -25,7 +24,7 @@ from pipelines.fingerprint import fingerprint
 from pipelines.mlflow_tracker import MlflowTracker, open_existing
 from pipelines.plan import Item, items, study_card, what_varies
 from pipelines.progress import LiveBoard, PlainBoard, duration
-from pipelines.ray_driver import _knock, sockets
+from pipelines.ray_driver import sockets
 from pipelines.recorder import Recorder
 from pipelines.run import Interrupts, _arguments, animated, run_study, show_status
 from pipelines.store import Checkpoints, Home, StoreError
@@ -464,7 +463,7 @@ def test_a_run_that_another_process_trains_is_trained_when_that_lets_go(
 
     monkeypatch.setattr(trainable, "PATIENCE", 0.0)
     monkeypatch.setattr(ray_driver, "fit", fit)
-    monkeypatch.setattr(ray_driver, "ray_session", lambda *args: nullcontext())
+    monkeypatch.setattr(ray_driver, "ray_session", lambda *args: nullcontext([]))
     key = f"{tiny().runs()[0].spec.id}-{fingerprint()}"
     Home(home).checkpoints(key).parent.mkdir()
     held = FileLock(f"{Home(home).checkpoints(key)}.lock")
@@ -600,13 +599,3 @@ def test_the_next_command_names_the_variant() -> None:
 def test_the_next_command_names_the_file_and_the_changes() -> None:
     study = Study.load(STUDIES / "coverage.yaml", "quick", ["seeds=1", "algo.alpha=0.1"])
     assert _arguments(study) == f"{STUDIES / 'coverage.yaml'} --profile quick --set seeds=1 --set algo.alpha=0.1"
-
-
-def test_a_cluster_that_is_not_there_is_one_line() -> None:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{free.getsockname()[1]}"
-    with pytest.raises(StoreError, match=f"RAY_ADDRESS={address}: .*refused"):
-        _knock(address)
-    _knock("auto")  # no place to knock at
-    _knock("ray://127.0.0.1:1")

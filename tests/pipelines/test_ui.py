@@ -62,6 +62,7 @@ def test_a_log_with_the_former_names_is_read_and_continued_without_doubles(home:
         (8, "eval/return", 2.0),
     ]
     assert tracker.client.get_run(log.ref).data.metrics == {"eval/return": 1.0, "return": 2.0}
+    assert tracker.rows([log.ref], {"eval/return"}) == tracker.rows([log.ref])
 
 
 @pytest.mark.parametrize("metric", [*HEADLINES.values(), "train/loss", "final/return"])
@@ -332,7 +333,7 @@ def test_the_overview_follows_a_launch_and_finds_what_an_earlier_one_left(monkey
     log.finish("finished")
 
     tracker = MemoryTracker(STUDY, shelf)
-    follows = Overview(STUDY, runs, tracker)
+    follows = Overview(STUDY, runs, tracker, tracker.recorded())
     follows.describe()
     assert tracker.files == {}
     assert tracker.note.startswith("Why?\n\n### So far\n\n1 of 2 runs are finished.")
@@ -354,7 +355,7 @@ def test_refreshes_keep_a_distance(monkeypatch: pytest.MonkeyPatch) -> None:
     tracker = MemoryTracker(STUDY, [])
     monkeypatch.setattr(tracker, "publish", lambda note, files: told.append(now[0]))
     slow, fast = plan()
-    follows = Overview(STUDY, [slow, fast], tracker)
+    follows = Overview(STUDY, [slow, fast], tracker, tracker.recorded())
     for now[0] in (100.0, 110.0, 129.0, 131.0):
         follows.ended("slow", slow.key, "failed")
     assert told == [100.0, 131.0]
