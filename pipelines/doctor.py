@@ -10,7 +10,7 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from pipelines.store import Home, StoreError, one_line
+from pipelines.store import Home, StoreError, one_line, without_password
 
 PYTHON = (3, 11)
 NEEDED = 2 * 2**30  # bytes free: a study of many runs with their checkpoints
@@ -114,12 +114,12 @@ def store(home: Home) -> Iterator[Finding]:
         yield Finding("fault", "store", str(error))
         return
     if runs is None:
-        yield Finding("ok", "store", f"{uri}: nothing logged yet")
+        yield Finding("ok", "store", f"{without_password(uri)}: nothing logged yet")
         return
     from pipelines.fingerprint import fingerprint
 
     here = fingerprint()
-    yield Finding("ok", "store", f"{uri}: {len(runs)} runs")
+    yield Finding("ok", "store", f"{without_password(uri)}: {len(runs)} runs")
     for status in ("running", "interrupted", "failed"):
         where = Counter(run.experiment for run in runs if run.status == status and run.fingerprint == here)
         if where:

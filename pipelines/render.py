@@ -12,8 +12,8 @@ import torch
 from torch import Generator, Tensor
 
 from pipelines import policy
+from pipelines.animation import Panel, Scene, gif
 from pipelines.document import choices
-from pipelines.drawing import Panel, Scene, animation
 from pipelines.errors import InputError
 from pipelines.store import Home, StoreError
 from rhmc.envs import ENVS, EnvConfig, coverage
@@ -131,7 +131,7 @@ def episode_gif(saved: policy.Saved, episode: int = 0, beside: str | None = None
     except ValueError as error:
         raise InputError(f"the policy cannot be used: {error}") from error
     own = f"{saved.spec.algo.kind}, seed {saved.spec.seed}, episode {episode}"
-    return animation(env, [Panel(own, play(env, trained(actor), episode)), *others], frames, MILLISECONDS)
+    return gif(env, [Panel(own, play(env, trained(actor), episode)), *others], frames, MILLISECONDS)
 
 
 def render(

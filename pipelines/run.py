@@ -6,7 +6,8 @@ import shlex
 import shutil
 import signal
 import sys
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -19,7 +20,7 @@ from pipelines.host import host
 from pipelines.plan import Item, commit, finished, items, study_card
 from pipelines.progress import Board, board, print_table
 from pipelines.recorder import Recorder
-from pipelines.store import Home, StoreError
+from pipelines.store import Home, StoreError, without_password
 from pipelines.study import Study
 from pipelines.tracker import Status, Tracker
 
@@ -51,12 +52,24 @@ def run_study(study: Study, home: Path) -> int:
         0 all finished, 1 some run failed, 2 something is in the way, 130 interrupted, 143 terminated. A second launch
         is always safe.
     """
+    return guarded(home, study.name, study.profile, lambda place, interrupts: _launch(study, place, interrupts))
+
+
+def guarded(home: Path, name: str, profile: str, launch: Callable[[Home, "Interrupts"], int]) -> int:
+    """Hold a study or a search while it is launched; what is in the way becomes one line and an exit code.
+
+    Args:
+        home: the work folder.
+        name: of the study or search.
+        profile: its profile.
+        launch: the work; gives the exit code.
+    """
     place, interrupts = Home(home), Interrupts()
     try:
         with interrupts:
             place.prepare()
-            with place.lock(study.name, study.profile):
-                return _launch(study, place, interrupts)
+            with place.lock(name, profile):
+                return launch(place, interrupts)
     except StoreError as error:
         print(f"rhmc: {error}", file=sys.stderr)
         return BAD
@@ -169,10 +182,13 @@ def train(study: Study, recorder: Recorder, home: Home, interrupts: Interrupts) 
         }
         for item in recorder.todo()
     ]
-    cpus = study.resources.concurrent * study.resources.cpus
+    concurrent, cpus = study.resources.concurrent, study.resources.cpus
+    session = ray_session(concurrent, cpus, home.name(study.name, study.profile), home.root)
     try:
-        with ray_session(cpus, home.name(study.name, study.profile)), interrupts.go_to(stop, recorder.board):
-            fit(jobs, recorder, scratch, study.resources.concurrent, study.resources.cpus, stop)
+        with session as remarks, interrupts.go_to(stop, recorder.board):
+            for remark in remarks:
+                recorder.board.say(remark)
+            fit(jobs, recorder, scratch, concurrent, cpus, stop)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
 
@@ -203,7 +219,7 @@ def _summary(study: Study, recorder: Recorder, tracker: "MlflowTracker") -> None
     next_command += "   (continues)" if recorder.left else ""
     lines = [
         f"look:  {tracker.where()}",
-        f"       experiment {tracker.name!r} in {tracker.uri}",
+        f"       experiment {tracker.name!r} in {without_password(tracker.uri)}",
         f"next:  {next_command}",
     ]
     console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
@@ -218,21 +234,26 @@ def _arguments(study: Study) -> str:
 
 def _arms(plan: list[Item], tracker: Tracker) -> list[list[str]]:
     refs = {(run.arm, run.key): run.ref for run in tracker.recorded() if run.status == "finished"}
-    wanted = {(item.card.arm, item.key): item for item in plan}
-    scores = {
-        row.ref: row.value
-        for row in tracker.rows([refs[place] for place in wanted if place in refs])
-        if row.metric == "final/return"
-    }
+    there = [refs[place] for arm in _by_arm(plan).values() for place in arm if place in refs]
+    scores = {row.ref: row.value for row in tracker.rows(there, {SCORE})}
     table = []
-    for arm in dict.fromkeys(item.card.arm for item in plan):
-        places = [place for place in wanted if place[0] == arm]
-        values = [scores[refs[place]] for place in places if refs.get(place) in scores]
+    for arm, places in _by_arm(plan).items():
+        done = [refs[place] for place in places if place in refs]
+        values = [scores[ref] for ref in done if ref in scores]
         mean = f"{sum(values) / len(values):.2f}" if values else "-"
-        table.append([arm, f"{len([p for p in places if p in refs])} of {len(places)}", mean])
+        table.append([arm, f"{len(done)} of {len(places)}", mean])
     return table
 
 
+def _by_arm(plan: list[Item]) -> dict[str, list[tuple[str, str]]]:
+    """The planned runs of each arm, as arm and key; what is planned twice once."""
+    arms: dict[str, dict[tuple[str, str], None]] = {}
+    for item in plan:
+        arms.setdefault(item.card.arm, {})[item.card.arm, item.key] = None
+    return {arm: list(places) for arm, places in arms.items()}
+
+
+SCORE = "final/return"
 STATES = ("finished", "running", "interrupted", "failed", "missing")
 
 
@@ -261,11 +282,14 @@ def _status(study: Study, home: Home) -> tuple[dict[str, dict[str, int]], bool]:
     tracker = open_existing(study_card(study), home)
     recorded = tracker.recorded() if tracker else []
     plan = items(study, fingerprint(), "")
-    state = {(run.arm, run.key): run.status for run in recorded}
+    # Runs of a driver that was killed are logged as running; a log in this folder knows no other driver than one here.
+    own = tracker is not None and tracker.uri == f"sqlite:///{home.database}"
+    seen = {"running": "interrupted"} if own and not home.driven(study.name, study.profile) else {}
+    state = {(run.arm, run.key): seen.get(run.status, run.status) for run in recorded}
     planned = {(item.card.arm, item.key) for item in plan}
+    stale = Counter(run.arm for run in recorded if (run.arm, run.key) not in planned)
     arms = {}
-    for arm in dict.fromkeys(item.card.arm for item in plan):
-        mine = [state.get(place, "missing") for place in planned if place[0] == arm]
-        stale = len([run for run in recorded if run.arm == arm and (run.arm, run.key) not in planned])
-        arms[arm] = {"planned": len(mine)} | {kind: mine.count(kind) for kind in STATES} | {"stale": stale}
+    for arm, places in _by_arm(plan).items():
+        mine = Counter(state.get(place, "missing") for place in places)
+        arms[arm] = {"planned": len(places)} | {kind: mine[kind] for kind in STATES} | {"stale": stale[arm]}
     return arms, planned <= finished(recorded)

@@ -384,6 +384,7 @@ def _settings(root: Node, profile: str, variant: str | None, patches: Sequence[N
     planned, found = _planned(root, chosen)
     faults += found + [fault for layer in last for fault in _unstated(common[0] if common else None, layer)]
     arms: dict[str, Setting] = {}
+    first: dict[str, str] = {}  # arm by its setting
     owners: dict[Fault, list[str]] = {}
     for name, (written, arm) in planned.items():
         faults += _unstated(common[0] if common else None, arm)
@@ -391,7 +392,8 @@ def _settings(root: Node, profile: str, variant: str | None, patches: Sequence[N
         for fault in set(found) - set(faults):
             owners.setdefault(fault, []).append(written)
         if setting is not None:
-            faults += _twin(setting, arms, arm, name, variant)
+            same = first.setdefault(setting.canonical(), name)
+            faults += _twin(same, arm, name, variant) if same != name else []
             arms[name] = setting
     plain = ("arms.",) if _group(root, "arms") else ("arms.", "grid.")
     faults += [f if f.path.startswith(plain) else _owned(f, names) for f, names in owners.items()]
@@ -559,10 +561,9 @@ def _unstated(base: Node | None, arm: Node) -> list[Fault]:
     return faults
 
 
-def _twin(setting: Setting, arms: dict[str, Setting], arm: Node, name: str, variant: str | None) -> list[Fault]:
-    same = [other for other, there in arms.items() if there == setting]
+def _twin(other: str, arm: Node, name: str, variant: str | None) -> list[Fault]:
     where = f" in variant {show(variant)}" if variant else ""
-    return [Fault(arm.key, arm.path, f"arm {show(name)} {TWIN} {show(other)}{where}") for other in same[:1]]
+    return [Fault(arm.key, arm.path, f"arm {show(name)} {TWIN} {show(other)}{where}")]
 
 
 def _owned(fault: Fault, arms: Sequence[str]) -> Fault:

@@ -40,7 +40,7 @@ class Size(NamedTuple):
 
 def sizes(policy: Policy, agents: Sequence[int], targets: Sequence[int]) -> list[Size]:
     """What to play: the trained numbers, other numbers of agents with them, and other numbers of targets with them."""
-    env = policy.spec.env
+    env = policy.saved.spec.env
     own = Size(env.agents, getattr(env, "targets", env.agents))
     changed = [Size(n, own.targets) for n in agents] + [Size(own.agents, m) for m in targets]
     return sorted({own, *changed})
@@ -55,14 +55,14 @@ def transfer(
         InputError: no such task, or a policy acts only with the numbers that it was trained with.
     """
     for policy in policies:
-        env = policy.spec.env
+        env = policy.saved.spec.env
         if env.kind != "coverage":
             raise InputError(
                 f"{policy.arm}: transfer is of coverage, where agents and targets have numbers of their own"
             )
         for size in sizes(policy, agents, targets):
             found = score(policy, Bank(episodes=episodes, agents=size.agents, targets=size.targets))
-            place = (study, policy.arm, policy.spec.seed, policy.spec.id, f"{env.kind} {env.preset}")
+            place = (study, policy.arm, policy.saved.spec.seed, policy.saved.spec.id, f"{env.kind} {env.preset}")
             values = (found.values["return"], found.values["return_sem"])
             yield (*place, *size, env.agents, env.targets, episodes, *values)
 

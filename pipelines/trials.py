@@ -309,6 +309,18 @@ def open_storage(home: Home, *, write: bool = True) -> BaseStorage | None:
         raise StoreError(f"{_shown(url)}: Optuna cannot use this database: {one_line(error)}") from error
 
 
+@contextmanager
+def opened(home: Home, *, write: bool = True) -> Iterator[BaseStorage | None]:
+    """`open_storage` for the length of a block."""
+    storage = open_storage(home, write=write)
+    try:
+        yield storage
+    finally:
+        if isinstance(storage, RDBStorage):
+            storage.remove_session()
+            storage.engine.dispose()
+
+
 def _open(url: str, write: bool) -> BaseStorage | None:
     if not url.startswith("sqlite:///"):
         return RDBStorage(url, engine_kwargs={"pool_pre_ping": True})

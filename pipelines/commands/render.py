@@ -49,7 +49,6 @@ def _of_study(file: Path, profile: str, variant: str | None, arm: str | None, se
     from pipelines.commands.common import load_study
     from pipelines.errors import InputError
     from pipelines.evaluation import of_study
-    from pipelines.policy import Saved
     from pipelines.store import StoreError, work_folder
 
     study = load_study(file, profile, None, variant)
@@ -57,4 +56,4 @@ def _of_study(file: Path, profile: str, variant: str | None, arm: str | None, se
         first = next(of_study(study, work_folder(), [arm] if arm else [], [] if seed is None else [seed]))
     except StoreError as error:
         raise InputError(str(error)) from error
-    return Saved(first.spec, first.state)
+    return first.saved

@@ -8,6 +8,7 @@ import pytest
 from pipelines import cli
 from pipelines.errors import InputError
 from pipelines.evaluation import Bank, Policy, score
+from pipelines.policy import Saved
 from pipelines.store import without_replay
 from pipelines.transfer import TRANSFER, Size, export_transfer, sizes, transfer
 from tests.pipelines.test_evaluation import of_kind, trained
@@ -16,7 +17,7 @@ from tests.pipelines.test_evaluation import of_kind, trained
 def policy(encoder: str = "pairwise") -> Policy:
     one = of_kind("iql", encoder)
     trainer, _ = trained(one)
-    return Policy("IQL", one, "finished", without_replay(trainer.state_dict())["algorithm"])
+    return Policy("IQL", Saved(one, without_replay(trainer.state_dict())["algorithm"]))
 
 
 def test_one_number_is_changed_at_a_time_and_the_trained_ones_are_played_too() -> None:

@@ -1,0 +1,331 @@
+"""What Ray, MLflow and checkpoints cost: the same trainings in a bare loop and through `rhmc study run`.
+
+Bare: a loop over `rhmc.trainer.Trainer` in plain processes, two at a time; no Ray, no log, no checkpoint. Both sides
+train the arms `full` and `no filter` of studies/ablation.yaml with two seeds each, bare and platform in turn, and must
+end with the same returns. Prints Markdown.
+
+Seconds of processor time come from the processes themselves, those of Ray's own processes from looking at them once a
+second. Evaluation is part of training. The parts of a launch are timed where they happen, inside one launch: where
+other work disturbs the machine, they are more exact than the difference between two launches.
+"""
+
+import argparse
+import json
+import multiprocessing
+import os
+import shlex
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import env_speed
+import psutil
+
+import rhmc.evaluate
+import rhmc.trainer
+from pipelines.study import RunSpec, Study
+from pipelines.trainable import RunTrainable
+
+ROOT = Path(__file__).parents[1]
+STUDY = Path("studies") / "ablation.yaml"
+RUNS, CONCURRENT = 4, 2
+RATE = 2_500  # environment steps that one run trains a second, evaluation included: only says how long a study to make
+Spent = dict[str, list[float]]  # label -> times, wall seconds, processor seconds
+WORKERS = ("training", "evaluation", "build", "checkpoint", "end of training", "animation")
+PARTS = {  # label -> where it is done, and what it grows with
+    "import": ("driver", "launches"),
+    "make the database": ("driver", "work folders"),
+    "open the log": ("driver", "launches"),
+    "start Ray": ("driver", "launches"),
+    "stop Ray": ("driver", "launches"),
+    "overview": ("driver", "launches; at most one in 30 s"),
+    "begin a run": ("driver", "runs"),
+    "end a run": ("driver", "runs"),
+    "register the policy": ("driver", "runs"),
+    "build": ("worker", "runs"),
+    "end of training": ("worker", "runs"),
+    "animation": ("worker", "arms"),
+    "checkpoint": ("worker", "points / 10"),
+    "log a point": ("driver", "points"),
+    "Tune": ("driver", "points"),
+    "evaluation": ("worker, part of training", "points"),
+}
+
+
+class Stopwatch:
+    """Times, wall seconds and processor seconds of the calling thread by label; what is timed inside is left out."""
+
+    def __init__(self) -> None:
+        self.spent: Spent = {}
+        self.inside = [[0.0, 0.0]]  # wall and processor seconds of what was timed inside each open label
+
+    @contextmanager
+    def time(self, label: str) -> Iterator[None]:
+        """Count what happens inside under the label."""
+        self.inside.append([0.0, 0.0])
+        wall, cpu = time.perf_counter(), time.thread_time()
+        try:
+            yield
+        finally:
+            whole = time.perf_counter() - wall, time.thread_time() - cpu
+            inner = self.inside.pop()
+            entry = self.spent.setdefault(label, [0, 0.0, 0.0])
+            entry[0] += 1
+            for i in range(2):
+                entry[i + 1] += whole[i] - inner[i]
+                self.inside[-1][i] += whole[i]
+
+    def watch(self, owner: Any, name: str, label: str) -> None:
+        """Time every call of a function from now on."""
+        function: Callable[..., Any] = getattr(owner, name)
+
+        def timed(*args: Any, **kwargs: Any) -> Any:
+            with self.time(label):
+                return function(*args, **kwargs)
+
+        setattr(owner, name, timed)
+
+
+def watch_evaluation(watch: Stopwatch) -> None:
+    """Time evaluations apart from the training they are part of; by this stopwatch alone."""
+    rhmc.trainer.evaluate = rhmc.evaluate.evaluate
+    watch.watch(rhmc.trainer, "evaluate", "evaluation")
+
+
+# Bare
+
+
+def train(spec: str) -> dict[str, Any]:
+    """One training in a loop; what a worker of the pool does."""
+    watch = Stopwatch()
+    watch_evaluation(watch)
+    run = RunSpec.model_validate_json(spec)
+    trainer = rhmc.trainer.Trainer(run.env, run.algo, run.trainer, run.seed)
+    began, last = time.time(), {}
+    while not trainer.done:
+        with watch.time("training"):
+            last = next(trainer)
+    ended = {"began": began, "ended": time.time(), "final": last["final/return"]}
+    return ended | {"spent": watch.spent, "pid": os.getpid(), "cpu": time.process_time()}
+
+
+def bare(changes: list[str], out: Path) -> None:
+    """Every run of the study, two at a time."""
+    study = Study.load(STUDY, "quick", changes)
+    with ProcessPoolExecutor(CONCURRENT, multiprocessing.get_context("spawn")) as pool:
+        runs = list(pool.map(train, [run.spec.canonical() for run in study.runs()]))
+    out.write_text(json.dumps({"runs": runs, "driver": time.process_time(), "parts": {}}))
+
+
+# The platform
+
+
+class Timed(RunTrainable):
+    """A worker that says what it did with its time. Ray gets it by value, and with it the stopwatch."""
+
+    def setup(self, config: dict[str, Any]) -> None:
+        """Start the clocks of a run."""
+        self.watch, self.began = Stopwatch(), 0.0
+        watch_evaluation(self.watch)
+        with self.watch.time("build"):
+            super().setup(config)
+
+    def _advance(self, trainer: Any) -> None:
+        self.began = self.began or time.time()
+        with self.watch.time("training"):
+            super()._advance(trainer)
+
+    def _save(self, trainer: Any) -> None:
+        with self.watch.time("end of training" if trainer.done else "checkpoint"):
+            super()._save(trainer)
+
+    def _animate(self, kept: Any) -> None:
+        with self.watch.time("animation"):
+            super()._animate(kept)
+
+    def step(self) -> dict[str, Any]:
+        """The result and the clocks."""
+        result = super().step()
+        clocks = {"began": self.began, "ended": time.time(), "spent": self.watch.spent}
+        return result | {"clocks": clocks | {"pid": os.getpid(), "cpu": time.process_time()}}
+
+
+def platform(changes: list[str], out: Path) -> None:
+    """`rhmc study run`, with clocks in it."""
+    start = time.perf_counter()
+    import ray
+    from ray import tune
+
+    from pipelines import cli, mlflow_tracker, overview, ray_driver, recorder, run
+
+    watch, runs = Stopwatch(), dict[str, dict[str, Any]]()
+    run.set_up_ray()
+    watch.spent["import"] = [1, time.perf_counter() - start, 0.0]
+    for owner, name, label in (
+        (mlflow_tracker, "create_database", "make the database"),
+        (mlflow_tracker.MlflowTracker, "__init__", "open the log"),
+        (ray, "init", "start Ray"),
+        (ray, "shutdown", "stop Ray"),
+        (recorder.Recorder, "start", "begin a run"),
+        (mlflow_tracker.MlflowRun, "log", "log a point"),
+        (mlflow_tracker.MlflowRun, "model", "register the policy"),
+        (recorder.Recorder, "_finish", "end a run"),
+        (overview.Overview, "publish", "overview"),
+        (tune.Tuner, "fit", "Tune"),
+    ):
+        watch.watch(owner, name, label)
+    record = recorder.Recorder.result
+
+    def noted(self: recorder.Recorder, key: str, result: dict[str, Any]) -> None:
+        runs[key] = result["clocks"]
+        runs[key]["final"] = next((p["final/return"] for p in result["points"] if "final/return" in p), None)
+        record(self, key, result)
+
+    recorder.Recorder.result = noted  # type: ignore[method-assign]
+    ray_driver.RunTrainable = Timed  # type: ignore[misc]
+    sys.argv = ["rhmc", *command(changes)]
+    try:
+        cli.main()
+    finally:
+        report = {"runs": list(runs.values()), "parts": watch.spent, "driver": time.process_time()}
+        out.write_text(json.dumps(report))
+
+
+# Both
+
+
+def changes(minutes: float) -> list[str]:
+    """What makes the study one of four runs and so long."""
+    steps = round(60 * minutes / RUNS * RATE)
+    return ["profiles.quick.arms=[full, no filter]", f"seeds={RUNS // 2}", f"steps={steps}"]
+
+
+def command(changes: list[str]) -> list[str]:
+    """What launches it, after `rhmc`."""
+    return ["study", "run", str(STUDY), *(word for text in changes for word in ("--set", text))]
+
+
+def launch(side: str, minutes: float, home: Path) -> dict[str, Any]:
+    """Run one side in processes of its own; what it reports, and `wall`, `start`, and `others`: Ray's processes."""
+    out = home / "report.json"
+    environment = os.environ | {"RHMC_HOME": str(home), "OMP_NUM_THREADS": "1"}
+    environment["PYTHONPATH"] = f"{ROOT}{os.pathsep}{ROOT / 'benchmarks'}"
+    start = time.time()
+    with (home / "log").open("w") as log:
+        words = [sys.executable, "-W", "ignore", __file__, "--side", side, "--out", str(out), "--minutes", str(minutes)]
+        process = subprocess.Popen(words, cwd=ROOT, env=environment, stdout=log, stderr=log, start_new_session=True)
+        seen = look(process)
+    if process.returncode or not out.exists():
+        sys.exit(f"{side} failed:\n{(home / 'log').read_text()[-3000:]}")
+    report: dict[str, Any] = json.loads(out.read_text())
+    known = {run["pid"] for run in report["runs"]} | {process.pid}
+    others = sum(cpu for pid, cpu in seen.items() if pid not in known) if side == "platform" else 0.0
+    return report | {"start": start, "wall": time.time() - start, "others": others}
+
+
+def look(process: "subprocess.Popen[bytes]") -> dict[int, float]:
+    """Processor seconds of every process of a session when it was last seen, until the first one ends."""
+    seen: dict[int, float] = {}
+    while True:
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(1.0)
+            return seen
+        for one in psutil.process_iter():
+            with suppress(psutil.Error, OSError):
+                if os.getsid(one.pid) == process.pid:
+                    times = one.cpu_times()
+                    seen[one.pid] = times.user + times.system
+
+
+def add(spent: list[Spent], label: str) -> list[float]:
+    """Times, wall and processor seconds of a label over all runs."""
+    entries = [one.get(label, [0, 0.0, 0.0]) for one in spent]
+    return [sum(values) for values in zip(*entries, strict=True)] or [0, 0.0, 0.0]
+
+
+class Account:
+    """A launch in figures: seconds on the clock, and of processors where it says `cpu`."""
+
+    def __init__(self, report: dict[str, Any]) -> None:
+        runs, self.parts = report["runs"], dict(report["parts"])
+        for label in WORKERS:
+            self.parts[label] = add([run["spent"] for run in runs], label)
+        self.wall, self.returns = report["wall"], sorted(run["final"] for run in runs)
+        self.training, self.training_cpu = (self.parts["training"][i] + self.parts["evaluation"][i] for i in (1, 2))
+        self.before = min(run["began"] for run in runs) - report["start"]
+        self.after = report["start"] + report["wall"] - max(run["ended"] for run in runs)
+        self.between = self.wall - self.before - self.after - self.training / CONCURRENT
+        last = {run["pid"]: run["cpu"] for run in sorted(runs, key=lambda run: float(run["cpu"]))}
+        self.cpus = {"the driver": report["driver"], "workers": sum(last.values()), "Ray's own": report["others"]}
+
+    @property
+    def over_cpu(self) -> float:
+        """Processor seconds that were not training, as a share of training's."""
+        return sum(self.cpus.values()) / self.training_cpu - 1
+
+    @property
+    def over_wall(self) -> float:
+        """Seconds on the clock in which a worker did not train, as a share of those in which it did."""
+        return self.wall * CONCURRENT / self.training - 1
+
+
+def launches(accounts: dict[str, list[Account]]) -> str:
+    """A table of all launches."""
+    head = ["", "training s", "of which evaluation", "wall s", "before the first point", "after the last", "between"]
+    head += ["training, CPU s", *(f"{name}, CPU s" for name in ("the driver", "workers", "Ray's own"))]
+    head += ["beside training, wall", "beside training, CPU"]
+    lines = [f"| {' | '.join(head)} |", "|---" + "|---:" * (len(head) - 1) + "|"]
+    for side, several in accounts.items():
+        for i, a in enumerate(several):
+            seconds = [a.training, a.parts["evaluation"][1], a.wall, a.before, a.after, a.between, a.training_cpu]
+            cells = [f"{side} {i + 1}", *(f"{value:.1f}" for value in (*seconds, *a.cpus.values()))]
+            lines.append(f"| {' | '.join([*cells, f'{a.over_wall:.1%}', f'{a.over_cpu:.1%}'])} |")
+    return "\n".join(lines)
+
+
+def parts(several: list[Account]) -> str:
+    """A table of what the launches through the platform did, medians over them."""
+    lines = ["| what | where | grows with | times | ms each | CPU ms each | CPU s in all | of training's CPU |"]
+    lines.append("|---|---|---|" + "---:|" * 5)
+    for label, (where, grows) in PARTS.items():
+        found = [(a.parts[label], a.training_cpu) for a in several if a.parts.get(label, [0])[0]]
+        if not found:
+            continue
+        times, wall, cpu = (median(part[i] for part, _ in found) for i in range(3))
+        share = median(part[2] / training for part, training in found)
+        each = f"{times:.0f} | {1e3 * wall / times:,.1f} | {1e3 * cpu / times:,.1f} | {cpu:.2f} | {share:.2%}"
+        lines.append(f"| {label} | {where} | {grows} | {each} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--minutes", type=float, default=10.0, help="of training, all runs together (default: 10)")
+    parser.add_argument("--repeats", type=int, default=1, help="launches of each side (default: 1)")
+    parser.add_argument("--side", choices=("bare", "platform"), help=argparse.SUPPRESS)
+    parser.add_argument("--out", type=Path, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.side:
+        {"bare": bare, "platform": platform}[args.side](changes(args.minutes), args.out)
+        return
+    accounts: dict[str, list[Account]] = {"bare": [], "platform": []}
+    for _ in range(args.repeats):
+        for side, several in accounts.items():
+            with tempfile.TemporaryDirectory() as folder:
+                several.append(Account(launch(side, args.minutes, Path(folder))))
+    ends = {tuple(account.returns) for several in accounts.values() for account in several}
+    print(f"{env_speed.machine()} {os.cpu_count()} cores.\n\n`rhmc {shlex.join(command(changes(args.minutes)))}`\n")
+    print(launches(accounts), parts(accounts["platform"]), sep="\n\n")
+    print(f"\nFinal returns of bare and platform: {'equal' if len(ends) == 1 else f'DIFFERENT, {ends}'}.")
+
+
+if __name__ == "__main__":
+    main()
