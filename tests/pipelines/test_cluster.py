@@ -50,6 +50,10 @@ STUDY = tiny(points=POINTS, arms={arm: setting(lr=rate) for arm, rate in {"slow"
 # An address
 
 
+def port_of(end: socket.socket) -> int:
+    return int(end.getsockname()[1])
+
+
 @contextmanager
 def listener(says: bytes) -> Iterator[str]:
     """The address of something that answers with these bytes."""
@@ -62,13 +66,13 @@ def listener(says: bytes) -> Iterator[str]:
             line.close()
 
         threading.Thread(target=answer, daemon=True).start()
-        yield f"127.0.0.1:{server.getsockname()[1]}"
+        yield f"127.0.0.1:{port_of(server)}"
 
 
 def test_a_cluster_that_is_not_there_is_one_line() -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{free.getsockname()[1]}"
+        address = f"127.0.0.1:{port_of(free)}"
         with pytest.raises(StoreError, match=f"RAY_ADDRESS={address}: .*refused"):
             knock(address)
 
@@ -88,6 +92,22 @@ def test_what_speaks_as_ray_does_is_let_through() -> None:
 def test_rays_client_is_refused() -> None:
     with pytest.raises(StoreError, match=r"RAY_ADDRESS=ray://127.0.0.1:1: only HOST:PORT or auto"):
         knock("ray://127.0.0.1:1")
+
+
+def test_a_head_that_dies_ends_the_launch(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    ended: list[int] = []
+    monkeypatch.setattr("os._exit", ended.append)
+    with (
+        socket.create_server(("127.0.0.1", 0)) as server,
+        cluster.watched(where := f"127.0.0.1:{port_of(server)}", 0.02),
+    ):
+        for _ in range(10):
+            server.accept()[0].close()
+        assert ended == []
+        server.close()
+        wait_for(lambda: ended, "the end")
+    assert ended == [2]
+    assert capsys.readouterr().err == f"rhmc: the cluster at {where} is gone; the same command continues\n"
 
 
 # Nodes
