@@ -1,8 +1,8 @@
 """What Ray, MLflow and checkpoints cost: the same trainings in a bare loop and through `rhmc study run`.
 
-Bare: a loop over `rhmc.trainer.Trainer` in plain processes, two at a time; no Ray, no log, no checkpoint. Both train
-the arms `full` and `no filter` of studies/ablation.yaml with two seeds each, bare and platform in turn, and must end with
-the same returns. Prints Markdown.
+Bare: a loop over `rhmc.trainer.Trainer` in plain processes, two at a time; no Ray, no log, no checkpoint. Both sides
+train the arms `full` and `no filter` of studies/ablation.yaml with two seeds each, bare and platform in turn, and must
+end with the same returns. Prints Markdown.
 
 Seconds of processor time come from the processes themselves, those of Ray's own processes from looking at them once a
 second. Evaluation is part of training. The parts of a launch are timed where they happen, inside one launch: where
@@ -17,7 +17,6 @@ import shlex
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -184,12 +183,12 @@ def platform(changes: list[str], out: Path) -> None:
         watch.watch(owner, name, label)
     record = recorder.Recorder.result
 
-    def result(self: recorder.Recorder, key: str, told: dict[str, Any]) -> None:
-        runs[key] = told["clocks"]
-        runs[key]["final"] = next((p["final/return"] for p in told["points"] if "final/return" in p), None)
-        record(self, key, told)
+    def noted(self: recorder.Recorder, key: str, result: dict[str, Any]) -> None:
+        runs[key] = result["clocks"]
+        runs[key]["final"] = next((p["final/return"] for p in result["points"] if "final/return" in p), None)
+        record(self, key, result)
 
-    recorder.Recorder.result = result  # type: ignore[method-assign]
+    recorder.Recorder.result = noted  # type: ignore[method-assign]
     ray_driver.RunTrainable = Timed  # type: ignore[misc]
     sys.argv = ["rhmc", *command(changes)]
     try:
@@ -234,15 +233,15 @@ def launch(side: str, minutes: float, home: Path) -> dict[str, Any]:
 def look(process: "subprocess.Popen[bytes]") -> dict[int, float]:
     """Processor seconds of every process of a session when it was last seen, until the first one ends."""
     seen: dict[int, float] = {}
-    ended = threading.Event()
-    threading.Thread(target=lambda: (process.wait(), ended.set()), daemon=True).start()
-    while not ended.wait(1.0):
+    while True:
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(1.0)
+            return seen
         for one in psutil.process_iter():
             with suppress(psutil.Error, OSError):
                 if os.getsid(one.pid) == process.pid:
                     times = one.cpu_times()
                     seen[one.pid] = times.user + times.system
-    return seen
 
 
 def add(spent: list[Spent], label: str) -> list[float]:

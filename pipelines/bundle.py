@@ -29,7 +29,7 @@ from pipelines.study import RunSpec, Study
 from pipelines.tracker import Card, Row, StudyCard, Tracker, points_of
 from rhmc.types import Frozen
 
-FORMAT = 1
+FORMAT = 2
 ARCHIVE = ".zip"
 MANIFEST = "bundle.json"
 RUNS = pa.schema(
@@ -54,7 +54,8 @@ class Manifest(Frozen):
     study: str
     profile: str
     note: str
-    params: tuple[str, ...] = ()
+    params: dict[str, tuple[str, ...]]
+    arms: tuple[str, ...]
     fingerprint: str
     commit: str
 
@@ -198,7 +199,7 @@ def unpack(bundle: Path, home: Path) -> Taken:
 
     with _opened(bundle) as folder:
         about, entries = _read(bundle, folder)
-        place, card = Home(home), StudyCard(about.study, about.profile, about.note, about.params)
+        place, card = Home(home), StudyCard(about.study, about.profile, about.note, about.params, about.arms)
         place.prepare()
         with place.lock(card.study, card.profile):
             tracker = MlflowTracker(card, place)

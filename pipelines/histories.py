@@ -5,7 +5,7 @@ own charts read gives a metric of up to a hundred runs. It is undocumented, so w
 """
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from mlflow import MlflowClient
@@ -39,12 +39,13 @@ class Histories:
         self.client, self.uri = client, uri
         self.together = uri.startswith(("http://", "https://"))
 
-    def of(self, runs: Iterable[Run]) -> Iterator[Value]:
-        """Every value of every metric of the runs."""
+    def of(self, runs: Iterable[Run], metrics: Collection[str] | None = None) -> Iterator[Value]:
+        """Every value of these metrics of the runs, of all metrics if None."""
         having: dict[str, list[str]] = defaultdict(list)
         for run in runs:
             for metric in run.data.metrics:
-                having[metric].append(run.info.run_id)
+                if metrics is None or metric in metrics:
+                    having[metric].append(run.info.run_id)
         for metric, refs in having.items():
             for start in range(0, len(refs), RUNS):
                 yield from self._some(metric, refs[start : start + RUNS])

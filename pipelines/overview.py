@@ -10,7 +10,7 @@ from io import BytesIO, StringIO
 from typing import NamedTuple
 
 from pipelines.plan import LISTED, Item, more
-from pipelines.tracker import Row, Status, StudyCard, Tracker
+from pipelines.tracker import Recorded, Row, Status, StudyCard, Tracker
 from rhmc.types import Metrics
 
 PAUSE = 30.0  # seconds between two refreshes while a study runs
@@ -42,17 +42,17 @@ class Overview:
     Args:
         study: whose.
         plan: its runs.
-        tracker: its log, asked once for what earlier launches left there.
+        tracker: its log, asked once for the values that earlier launches left there.
+        recorded: the runs in it.
     """
 
-    def __init__(self, study: StudyCard, plan: Sequence[Item], tracker: Tracker) -> None:
+    def __init__(self, study: StudyCard, plan: Sequence[Item], tracker: Tracker, recorded: Iterable[Recorded]) -> None:
         self.study, self.tracker = study, tracker
         self.runs = {(item.card.arm, item.key): Run(item.card.arm, item.card.seed, None, (), {}) for item in plan}
-        there = {run.ref: run for run in tracker.recorded() if (run.arm, run.key) in self.runs}
+        there = {run.ref: run for run in recorded if (run.arm, run.key) in self.runs}
         rows: dict[str, list[Row]] = {ref: [] for ref in there}
-        for row in tracker.rows(list(there)) if there else []:
-            if row.metric == CURVE or row.metric in FINALS:
-                rows[row.ref].append(row)
+        for row in tracker.rows(list(there), {CURVE, *FINALS}) if there else []:
+            rows[row.ref].append(row)
         for ref, run in there.items():
             self._take(run.arm, run.key, run.status, [(row.step, {row.metric: row.value}) for row in rows[ref]])
         self.shown = float("-inf")
@@ -78,7 +78,7 @@ class Overview:
 
     def describe(self) -> None:
         """Refresh the description alone."""
-        self.tracker.publish(f"{self.study.note}\n\n{so_far(list(self.runs.values()))}", {})
+        self.tracker.publish(self._note(list(self.runs.values())), {})
 
     def publish(self) -> None:
         """Refresh the description, the figure and the table."""
@@ -87,7 +87,12 @@ class Overview:
         files = {TABLE: table(runs).encode()}
         if any(run.curve for run in runs):
             files[FIGURE] = figure(self.study, runs)
-        self.tracker.publish(f"{self.study.note}\n\n{so_far(runs)}", files)
+        self.tracker.publish(self._note(runs), files)
+
+    def _note(self, runs: Sequence[Run]) -> str:
+        """The question, what is known by now, and the rest of the study's own note."""
+        question, _, rest = self.study.note.partition("\n\n")
+        return f"{question}\n\n{so_far(runs)}\n\n{rest}".rstrip()
 
 
 def by_arm(runs: Iterable[Run]) -> dict[str, list[Run]]:

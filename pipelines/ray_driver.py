@@ -157,7 +157,7 @@ class Queue(Searcher):
         super().__init__()
         self.jobs = deque(jobs)
 
-    def suggest(self, trial_id: str) -> dict[str, Any] | str:
+    def suggest(self, trial_id: str) -> Any:
         """The configuration of the next trial."""
         return {"job": self.jobs.popleft()} if self.jobs else Searcher.FINISHED
 

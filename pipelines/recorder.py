@@ -11,7 +11,7 @@ from pipelines.policy import CONFIG, FILE
 from pipelines.progress import Board
 from pipelines.render import EPISODE, WHY_NOT
 from pipelines.store import Checkpoints, Home
-from pipelines.tracker import RunLog, Status, StudyCard, Tracker, points_of
+from pipelines.tracker import Recorded, RunLog, Status, StudyCard, Tracker, points_of
 from rhmc.trainer import grid_step
 
 EXTRAS = (EPISODE, WHY_NOT)  # what a training may leave beside its policy
@@ -38,14 +38,23 @@ class Recorder:
         self.waiting: dict[str, list[Item]] = defaultdict(list)
         self.places: dict[str, list[str]] = defaultdict(list)  # key -> the nodes that trained it in this launch
         self.busy = False  # whether one of them was out of reach, and may be trained by now
-        done = finished(tracker.recorded())
+        recorded = tracker.recorded()
+        done = finished(recorded)
         for item in plan:
             if (item.card.arm, item.key) not in done:
                 self.waiting[item.key].append(item)
         self.skipped = len(plan) - self.left
-        self.overview = Overview(study, plan, tracker)
+        self.overview = Overview(study, plan, tracker, recorded)
         self.overview.describe()
+        self._set_aside(recorded)
         self._tidy()
+
+    def _set_aside(self, recorded: list[Recorded]) -> None:
+        """Keep what was logged under another plan, other steps say, from being averaged with the runs of this one."""
+        planned = {(item.card.arm, item.key) for item in self.plan}
+        for run in recorded:
+            if run.stale == ((run.arm, run.key) in planned):
+                self.tracker.mark(run.ref, stale=not run.stale)
 
     def _tidy(self) -> None:
         """Remove what a launch left that was killed between finishing a run and removing its checkpoints."""

@@ -123,7 +123,7 @@ def _written(
 
 def signature(spec: RunSpec) -> ModelSignature:
     """The arrays that a policy takes and gives; -1 is the batch."""
-    size, real = sizes(spec), np.dtype("float32")
+    size, real = sizes(spec.env), np.dtype("float32")
     given: list[ColSpec | TensorSpec] = [
         TensorSpec(array.dtype, (-1, *array.shape[1:]), name) for name, array in example(spec).items()
     ]

@@ -6,6 +6,7 @@ import shlex
 import shutil
 import signal
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, Self
 from rich.console import Console
 
 from pipelines.fingerprint import fingerprint
+from pipelines.host import host
 from pipelines.plan import Item, commit, finished, items, study_card
 from pipelines.progress import Board, board, print_table
 from pipelines.recorder import Recorder
@@ -134,7 +136,7 @@ def _launch(study: Study, home: Home, interrupts: Interrupts) -> int:
     tracker = MlflowTracker(card, home)
     status: Status = "interrupted"
     try:
-        plan = items(study, fingerprint(), commit())
+        plan = items(study, fingerprint(), commit(), host())
         with board(Console()) as display:
             recorder = Recorder(card, plan, tracker, home, display)
             if recorder.skipped:
@@ -232,21 +234,26 @@ def _arguments(study: Study) -> str:
 
 def _arms(plan: list[Item], tracker: Tracker) -> list[list[str]]:
     refs = {(run.arm, run.key): run.ref for run in tracker.recorded() if run.status == "finished"}
-    wanted = {(item.card.arm, item.key): item for item in plan}
-    scores = {
-        row.ref: row.value
-        for row in tracker.rows([refs[place] for place in wanted if place in refs])
-        if row.metric == "final/return"
-    }
+    there = [refs[place] for arm in _by_arm(plan).values() for place in arm if place in refs]
+    scores = {row.ref: row.value for row in tracker.rows(there, {SCORE})}
     table = []
-    for arm in dict.fromkeys(item.card.arm for item in plan):
-        places = [place for place in wanted if place[0] == arm]
-        values = [scores[refs[place]] for place in places if refs.get(place) in scores]
+    for arm, places in _by_arm(plan).items():
+        done = [refs[place] for place in places if place in refs]
+        values = [scores[ref] for ref in done if ref in scores]
         mean = f"{sum(values) / len(values):.2f}" if values else "-"
-        table.append([arm, f"{len([p for p in places if p in refs])} of {len(places)}", mean])
+        table.append([arm, f"{len(done)} of {len(places)}", mean])
     return table
 
 
+def _by_arm(plan: list[Item]) -> dict[str, list[tuple[str, str]]]:
+    """The planned runs of each arm, as arm and key; what is planned twice once."""
+    arms: dict[str, dict[tuple[str, str], None]] = {}
+    for item in plan:
+        arms.setdefault(item.card.arm, {})[item.card.arm, item.key] = None
+    return {arm: list(places) for arm, places in arms.items()}
+
+
+SCORE = "final/return"
 STATES = ("finished", "running", "interrupted", "failed", "missing")
 
 
@@ -275,11 +282,14 @@ def _status(study: Study, home: Home) -> tuple[dict[str, dict[str, int]], bool]:
     tracker = open_existing(study_card(study), home)
     recorded = tracker.recorded() if tracker else []
     plan = items(study, fingerprint(), "")
-    state = {(run.arm, run.key): run.status for run in recorded}
+    # Runs of a driver that was killed are logged as running; a log in this folder knows no other driver than one here.
+    own = tracker is not None and tracker.uri == f"sqlite:///{home.database}"
+    seen = {"running": "interrupted"} if own and not home.driven(study.name, study.profile) else {}
+    state = {(run.arm, run.key): seen.get(run.status, run.status) for run in recorded}
     planned = {(item.card.arm, item.key) for item in plan}
+    stale = Counter(run.arm for run in recorded if (run.arm, run.key) not in planned)
     arms = {}
-    for arm in dict.fromkeys(item.card.arm for item in plan):
-        mine = [state.get(place, "missing") for place in planned if place[0] == arm]
-        stale = len([run for run in recorded if run.arm == arm and (run.arm, run.key) not in planned])
-        arms[arm] = {"planned": len(mine)} | {kind: mine.count(kind) for kind in STATES} | {"stale": stale}
+    for arm, places in _by_arm(plan).items():
+        mine = Counter(state.get(place, "missing") for place in places)
+        arms[arm] = {"planned": len(places)} | {kind: mine[kind] for kind in STATES} | {"stale": stale[arm]}
     return arms, planned <= finished(recorded)

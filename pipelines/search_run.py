@@ -336,8 +336,8 @@ def search_card(search: Search) -> StudyCard:
         f"pruner {search.pruner.kind}.\n\n" + "\n".join(spaces) + "\n\nA run is a trial: its curve is the mean over "
         "its seeds, `objective` the mean of their final returns. Pruned trials have no `objective`."
     )
-    params = {f"algo.{name}": None for arm in search.arms.values() for name in arm.space}
-    return StudyCard(search.name, search.profile, note, ("method", *params))
+    params = {name: [f"algo.{setting}" for setting in arm.space] for name, arm in search.arms.items()}
+    return StudyCard(search.name, search.profile, note, params, list(search.arms))
 
 
 # Results

@@ -4,12 +4,14 @@ A run in a log is named by study, profile, arm and key (spec id and code fingerp
 already continues it. A point that is logged already is not logged again.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
+from types import MappingProxyType
 from typing import Literal, NamedTuple, Protocol
 
+from pipelines.host import Host
 from rhmc.types import Metrics
 
 Status = Literal["running", "finished", "failed", "interrupted"]
@@ -21,7 +23,8 @@ class StudyCard(NamedTuple):
     study: str
     profile: str
     note: str  # Markdown: question, arms, seeds, budget
-    params: tuple[str, ...] = ()  # names of what varies between its runs, and method and seed
+    params: Mapping[str, Sequence[str]] = MappingProxyType({})  # what varies, by method (arm of a search)
+    arms: Sequence[str] = ()
 
 
 class Card(NamedTuple):
@@ -36,6 +39,7 @@ class Card(NamedTuple):
     commit: str
     params: dict[str, str]  # what varies between the runs of the study, and method and seed
     trial: int | None = None  # of a search: then the run stands for all of its seeds
+    host: Host = Host()  # that starts it
 
     @property
     def key(self) -> str:
@@ -56,6 +60,8 @@ class Recorded(NamedTuple):
     key: str
     status: Status
     commit: str
+    stale: bool = False  # marked as no part of the latest plan
+    host: Host = Host()
 
 
 class Row(NamedTuple):
@@ -109,12 +115,16 @@ class Tracker(Protocol):
         """Key -> ref of a finished run, of whatever study shares the log."""
         ...
 
+    def mark(self, ref: str, *, stale: bool) -> None:
+        """Say of a run whether the latest plan is without it: then it stays, and views and averages pass over it."""
+        ...
+
     def start(self, card: Card) -> RunLog:
         """Begin a run, or continue it."""
         ...
 
-    def rows(self, refs: Sequence[str]) -> list[Row]:
-        """All values of the runs, each metric and step once, sorted."""
+    def rows(self, refs: Sequence[str], metrics: Collection[str] | None = None) -> list[Row]:
+        """All values of the runs, or those of some metrics; each metric and step once, sorted."""
         ...
 
     def file(self, ref: str, name: str, folder: Path) -> Path | None:
@@ -208,7 +218,18 @@ class MemoryTracker:
 
     def recorded(self) -> list[Recorded]:
         """See `Tracker`."""
-        return [Recorded(r.ref, r.card.arm, r.card.key, r.status, r.card.commit) for r in self._mine()]
+        return [
+            Recorded(r.ref, r.card.arm, r.card.key, r.status, r.card.commit, "stale" in r.tags, r.card.host)
+            for r in self._mine()
+        ]
+
+    def mark(self, ref: str, *, stale: bool) -> None:
+        """See `Tracker`."""
+        (run,) = (run for run in self.shelf if run.ref == ref)
+        if stale:
+            run.tags["stale"] = "yes"
+        else:
+            run.tags.pop("stale", None)
 
     def finished_anywhere(self, fingerprint: str) -> dict[str, str]:
         """See `Tracker`."""
@@ -225,9 +246,10 @@ class MemoryTracker:
         self.shelf.append(run)
         return run
 
-    def rows(self, refs: Sequence[str]) -> list[Row]:
+    def rows(self, refs: Sequence[str], metrics: Collection[str] | None = None) -> list[Row]:
         """See `Tracker`."""
-        return sorted(row for run in self.shelf if run.ref in refs for row in run.values)
+        found = (row for run in self.shelf if run.ref in refs for row in run.values)
+        return sorted(row for row in found if metrics is None or row.metric in metrics)
 
     def file(self, ref: str, name: str, folder: Path) -> Path | None:
         """See `Tracker`."""

@@ -326,10 +326,10 @@ def damage(home: Path, rng: random.Random) -> str:
 
 def damaged(content: bytes, kind: str, rng: random.Random) -> bytes:
     """The content after a damage of `DAMAGES`."""
+    if kind == "empty" or not content:  # emptied before, and nobody has looked since
+        return b""
     if kind == "cut short":
         return content[: rng.randrange(len(content))]
-    if kind == "empty":
-        return b""
     if kind == "noise":
         return rng.randbytes(len(content))
     size = min(512, len(content))

@@ -109,8 +109,13 @@ def test_the_newest_checkpoint_of_a_folder_is_read(tmp_path: Path) -> None:
     for point in (1, 2):
         state = state_of(one) | {"step": point}
         save_atomically(tmp_path / f"{point:08d}.pt", {"trainer": state, "spec": one.canonical()})
-    assert policy._file(tmp_path).name == "00000002.pt"
     assert policy.load(tmp_path).spec == one
+    assert policy.load(tmp_path).reached == "at step 2"
+    (tmp_path / "00000002.pt").write_bytes(b"cut short")
+    assert policy.load(tmp_path).reached == "at step 1"
+    (tmp_path / "00000001.pt").unlink()
+    with pytest.raises(InputError, match=r"00000002\.pt: not a readable checkpoint"):
+        policy.load(tmp_path)
 
 
 def test_what_is_no_policy(tmp_path: Path) -> None:
@@ -120,7 +125,7 @@ def test_what_is_no_policy(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     for name, said in {
         "text.pt": "text.pt: not a readable checkpoint",
-        "other.pt": "other.pt: a PyTorch file, but not a checkpoint of a run",
+        "other.pt": "other.pt: readable, but not a checkpoint of a run",
         "odd.pt": "odd.pt: not the settings of a run that this code knows",
         "empty": "empty: no policy.pt and no checkpoint in this folder",
         "none.pt": "none.pt: no such file",

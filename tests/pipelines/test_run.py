@@ -1,6 +1,7 @@
 """From a plan to a log: the recorder with the twin and no Ray, then the whole chain."""
 
 import io
+import json
 import os
 import signal
 import sys
@@ -20,8 +21,8 @@ from ruamel.yaml import YAML
 from pipelines import progress, ray_driver, run, trainable
 from pipelines.export import export_study
 from pipelines.fingerprint import fingerprint
-from pipelines.mlflow_tracker import open_existing
-from pipelines.plan import Item, study_card, what_varies
+from pipelines.mlflow_tracker import MlflowTracker, open_existing
+from pipelines.plan import Item, items, study_card, what_varies
 from pipelines.progress import LiveBoard, PlainBoard, duration
 from pipelines.ray_driver import sockets
 from pipelines.recorder import Recorder
@@ -84,6 +85,21 @@ def test_a_finished_run_is_logged_whole_and_skipped_afterwards(launch: Launch, s
     again = launch()
     assert [item.key for item in again.todo()] == [fast]
     assert again.skipped == 1
+
+
+def test_what_was_logged_under_another_plan_is_set_aside_until_it_is_planned_again(
+    launch: Launch, shelf: list[MemoryRun]
+) -> None:
+    recorder = launch()
+    for key in [item.key for item in recorder.todo()]:
+        step(recorder, key)
+        finish(recorder, key)
+    launch(plan()[:1])
+    assert [run.tags for run in shelf] == [{}, {"stale": "yes"}]
+    launch(plan()[1:])
+    assert [run.tags for run in shelf] == [{"stale": "yes"}, {}]
+    assert launch().skipped == 2
+    assert [run.tags for run in shelf] == [{}, {}]
 
 
 def test_the_whole_configuration_is_kept(launch: Launch, shelf: list[MemoryRun]) -> None:
@@ -303,6 +319,21 @@ def test_a_terminal_gets_a_line_per_running_run() -> None:
     for part in ("full s0", "500/1,000", "50 steps/s", "return 2.00", "10 s left", "full s1", "starting"):
         assert part in shown
     assert "full s0: finished, return 2.00" in out.getvalue()
+
+
+def test_runs_of_a_killed_driver_are_not_said_to_be_running(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    study = tiny()
+    plan = items(study, fingerprint(), "")
+    MlflowTracker(study_card(study), Home(home)).start(plan[0].card)
+
+    def slow() -> dict[str, int]:
+        assert show_status(study, home, as_json=True) == 1
+        arm: dict[str, int] = json.loads(capsys.readouterr().out)["arms"]["slow"]
+        return arm
+
+    with Home(home).lock(study.name, study.profile):
+        assert (slow()["running"], slow()["interrupted"]) == (1, 0)
+    assert (slow()["running"], slow()["interrupted"]) == (0, 1)
 
 
 # What may be in the way

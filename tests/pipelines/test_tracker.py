@@ -13,6 +13,7 @@ import pytest
 from mlflow import MlflowClient
 
 from pipelines import histories, mlflow_tracker
+from pipelines.host import Host
 from pipelines.mlflow_tracker import MlflowTracker, open_existing
 from pipelines.names import shown
 from pipelines.store import Home, StoreError, without_password
@@ -87,6 +88,16 @@ def test_points_that_were_never_logged_are_filled_in(opened: Open) -> None:
     assert logged_steps(tracker, run.ref, "train/loss") == [0, 8, 16, 24, 32]
 
 
+def test_some_metrics_are_read_alone(opened: Open) -> None:
+    tracker = opened()
+    run = tracker.start(CARD)
+    run.log([point(step, **{"eval/coverage": 1.0}) for step in (0, 8)])
+    wanted = {"eval/return", "train/loss", "none/such"}
+    assert tracker.rows([run.ref], wanted) == [row for row in tracker.rows([run.ref]) if row.metric in wanted]
+    assert [row.step for row in tracker.rows([run.ref], {"eval/return"})] == [0, 8]
+    assert tracker.rows([run.ref], set()) == []
+
+
 def test_runs_are_told_apart_by_arm_and_key(opened: Open) -> None:
     tracker = opened()
     cards = [CARD, CARD._replace(arm="none"), CARD._replace(spec_id="0ther"), CARD._replace(fingerprint="changed")]
@@ -107,6 +118,16 @@ def test_the_status_is_kept_and_a_new_launch_reopens(opened: Open, status: str) 
     assert [run.status for run in tracker.recorded()] == ["running"]
     tracker.close("interrupted")
     assert [run.status for run in tracker.recorded()] == ["interrupted"]
+
+
+def test_a_stale_run_is_marked_until_it_is_planned_again(opened: Open) -> None:
+    tracker = opened()
+    refs = [tracker.start(card).ref for card in (CARD, CARD._replace(spec_id="0ther"))]
+    assert [run.stale for run in tracker.recorded()] == [False, False]
+    tracker.mark(refs[0], stale=True)
+    assert [run.stale for run in opened().recorded()] == [True, False]
+    opened().mark(refs[0], stale=False)
+    assert [run.stale for run in opened().recorded()] == [False, False]
 
 
 def test_a_launch_leaves_other_studies_alone(opened: Open) -> None:
@@ -159,8 +180,11 @@ def test_how_a_run_looks_in_mlflow(home: Path) -> None:
         "mlflow.parentRunId": tracker.parent,
     }
     assert run.data.tags.items() >= expected.items()
-    assert parent.data.tags["mlflow.note.content"] == "**Why?**"
-    assert tracker.client.get_experiment(run.info.experiment_id).tags["mlflow.note.content"] == "**Why?**"
+    assert "machine" not in run.data.tags  # not known: no empty word
+    tracker.start(CARD._replace(spec_id="other", host=Host("a machine", "torch 2"))).finish("finished")
+    assert {run.key: run.host for run in tracker.recorded()}["other-c0de"] == ("a machine", "torch 2")
+    assert parent.data.tags["mlflow.note.content"].startswith("**Why?** [Curves by arm](#/experiments/")
+    assert tracker.client.get_experiment(run.info.experiment_id).tags["mlflow.note.content"].startswith("**Why?** [")
     assert tracker.file(log.ref, "none.pt", home) is None
     (home / "copy").mkdir()
     kept = tracker.file(log.ref, "policy.pt", home / "copy")
@@ -239,6 +263,9 @@ def test_reading_at_once_and_through_the_client_agree(home: Path) -> None:
     refs = [run.ref for run in runs[:2]]
     assert sorted(tracker._rows_sqlite(refs)) == sorted(tracker._rows_client(refs)) == tracker.rows(refs)
     assert len(tracker.rows(refs)) == 2 * 3 * 5
+    some = {"eval/return", "eval/max"}
+    assert sorted(tracker._rows_sqlite(refs, some)) == sorted(tracker._rows_client(refs, some))
+    assert len(tracker.rows(refs, some)) == 2 * 2 * 5
 
 
 def test_a_server_is_asked_for_a_metric_of_many_runs_at_once(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
