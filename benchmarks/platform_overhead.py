@@ -233,15 +233,29 @@ def launch(side: str, minutes: float, home: Path) -> dict[str, Any]:
 def look(process: "subprocess.Popen[bytes]") -> dict[int, float]:
     """Processor seconds of every process of a session when it was last seen, until the first one ends."""
     seen: dict[int, float] = {}
-    while True:
-        with suppress(subprocess.TimeoutExpired):
-            process.wait(1.0)
-            return seen
-        for one in psutil.process_iter():
-            with suppress(psutil.Error, OSError):
-                if os.getsid(one.pid) == process.pid:
+    try:
+        while True:
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(1.0)
+                return seen
+            for one in session(process.pid):
+                with suppress(psutil.Error):
                     times = one.cpu_times()
                     seen[one.pid] = times.user + times.system
+    except KeyboardInterrupt:
+        for one in session(process.pid):
+            with suppress(psutil.Error):
+                one.kill()
+        process.wait()
+        raise
+
+
+def session(leader: int) -> Iterator[psutil.Process]:
+    """The processes that one started, Ray's among them."""
+    for one in psutil.process_iter():
+        with suppress(psutil.Error, OSError):
+            if os.getsid(one.pid) == leader:
+                yield one
 
 
 def add(spent: list[Spent], label: str) -> list[float]:
@@ -276,8 +290,10 @@ class Account:
         return self.wall * CONCURRENT / self.training - 1
 
 
-HEAD = ("launch", "training s", "of it evaluation", "wall s", "before the first point", "after the last", "between")
-HEAD += ("training, CPU s", "the driver, CPU s", "workers, CPU s", "Ray's own, CPU s", "over, wall", "over, CPU")
+HEAD = (
+    *("launch", "training s", "of it evaluation", "wall s", "before the first point", "after the last", "between"),
+    *("training, CPU s", "the driver, CPU s", "workers, CPU s", "Ray's own, CPU s", "over, wall", "over, CPU"),
+)
 
 
 def line(name: str, a: Account) -> str:
