@@ -36,7 +36,9 @@ os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "4")  # 28 s: a server 
 from mlflow import MlflowClient
 from mlflow.entities import Experiment, Metric, Param, Run, RunTag, ViewType
 from mlflow.exceptions import MlflowException
+from sqlalchemy import create_engine
 from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.pool import NullPool
 
 STATUS: dict[Status, str] = {
     "running": "RUNNING",
@@ -49,6 +51,7 @@ SERVER = ("http://", "https://")  # how the address of one begins
 BATCH = 1000  # values that one request may carry
 PARENT = "study"  # tag `role` of the parent run; its runs have `run`
 PATIENCE = 20.0  # seconds that a reader waits for a writer of SQLite, as MLflow's own do
+DATABASES = ("postgresql", "mysql", "mssql")  # with a server, that MLflow can write to itself
 NOTE = "mlflow.note.content"  # the tag that MLflow shows as a description
 LONGEST = 8000  # characters of a run's tag
 ARMS = "arms"  # the experiment's tag with its arms as JSON, in the order in which they came: it decides their colours
@@ -545,6 +548,9 @@ def check(uri: str) -> None:
         _check_server(uri)
     elif "://" not in uri:
         raise StoreError(f"MLFLOW_TRACKING_URI={uri}: not an address; http://HOST:PORT and sqlite:///FILE are some")
+    elif uri.partition(":")[0].partition("+")[0] in DATABASES:
+        with explained(uri):  # once: MLflow would try for a minute and a half
+            create_engine(uri, poolclass=NullPool).connect().close()
 
 
 def _check_file(path: Path) -> None:

@@ -254,9 +254,11 @@ def without_password(uri: str) -> str:
 
 
 def one_line(error: BaseException) -> str:
-    """The first telling line of an error."""
+    """The first telling line of an error; of a traceback, which some libraries wrap as it is, the last."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[0] if lines else type(error).__name__
+    if not lines:
+        return type(error).__name__
+    return lines[-1] if lines[0].startswith("Traceback (") else lines[0]
 
 
 def reason(error: BaseException) -> str:

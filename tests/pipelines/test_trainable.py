@@ -295,3 +295,15 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
 
 def test_no_checkpoint_is_no_state(tmp_path: Path) -> None:
     assert Checkpoints(tmp_path / "none").newest() is None
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("", "ValueError"),
+        ("\n  first\nsecond", "first"),
+        ("Traceback (most recent call last):\n  File x\nKeyError: 'place'\n", "KeyError: 'place'"),
+    ],
+)
+def test_an_error_in_one_line(text: str, line: str) -> None:
+    assert store.one_line(ValueError(text)) == line
