@@ -136,6 +136,7 @@ def test_the_figure_of_transfer_moves_one_number_at_a_time(tmp_path: Path) -> No
     assert drawing is not None
     rows = drawing.numbers.set_index(["along", "name"]).sort_index()
     assert rows.loc[("agents", "RHMC"), "count"].tolist() == [2, 4, 6]
+    assert rows.loc[("agents", "RHMC"), "value"].tolist() == [41, 71, 81]  # those with other targets are not in it
     assert rows.loc[("targets", "RHMC"), "count"].tolist() == [3, 5]
     assert ("targets", "IQL") not in rows.index  # played with one number of targets only
     assert rows.loc[("agents", "best_window"), "value"].tolist() == [65.3, 78.0]
