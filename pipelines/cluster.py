@@ -6,6 +6,8 @@ code travels with the launch; Python, the libraries and the work folder have to 
 
 import os
 import socket
+import sys
+import threading
 import uuid
 from collections import Counter
 from collections.abc import Iterator
@@ -23,6 +25,8 @@ from pipelines.fingerprint import fingerprint, package_folder
 from pipelines.store import StoreError, one_line
 
 KNOCK = 5.0  # seconds to wait for a cluster to answer
+PULSE, MISSES = 8.0, 3  # seconds between two looks at the head, and how many in a row may find nobody
+GONE = 2  # exit code where the head is: something is in the way
 ANSWER = 90.0  # seconds to wait for a node to look around: it may start a process and import torch
 DEATHS = 3  # workers that may die in a row on one training without getting it further
 NODE_DIED = "its node has died"  # in what Ray says of an actor
@@ -56,6 +60,38 @@ def knock(where: str) -> None:
         raise _refused(where, one_line(error)) from error
     if answered[3:4] != bytes([SETTINGS]) and os.environ.get("RAY_USE_TLS", "0") == "0":
         raise _refused(where, "what answers there is not Ray")
+
+
+@contextmanager
+def watched(where: str, pulse: float = PULSE) -> Iterator[None]:
+    """While a cluster is used: should its head die, end this process with one line.
+
+    Ray would hold on for a minute and then end the process itself, as if a run had failed.
+
+    Args:
+        where: the head, host:port.
+        pulse: seconds between two looks.
+    """
+    host, _, port = where.rpartition(":")
+    over = threading.Event()
+
+    def watch() -> None:
+        missed = 0
+        while missed < MISSES and not over.wait(pulse):
+            try:
+                socket.create_connection((host.strip("[]"), int(port)), KNOCK).close()
+                missed = 0
+            except OSError:
+                missed += 1
+        if not over.is_set():
+            print(f"rhmc: the cluster at {where} is gone; the same command continues", file=sys.stderr, flush=True)
+            os._exit(GONE)
+
+    threading.Thread(target=watch, name="head", daemon=True).start()
+    try:
+        yield
+    finally:
+        over.set()
 
 
 def _refused(where: str, why: str) -> StoreError:

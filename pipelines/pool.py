@@ -53,6 +53,9 @@ class Worker:
     def __init__(self) -> None:
         self.training: TrialTraining | None = None
 
+    def ready(self) -> None:
+        """Answers once there is a processor for it."""
+
     def begin(self, job: TrialJob) -> dict[str, Any]:
         """Take a trial, continue it where it was left, and train to the next point."""
         result: dict[str, Any] = {"busy": True}
@@ -82,6 +85,7 @@ class Taken:
 
     job: TrialJob
     actor: Any
+    room: Any = None  # a call that ends once the actor has its processors; None if it had them before
     seen: int = 0  # points that this worker told
     told: int = 0  # points that went out, of all workers that had it
     place: Place | None = None
@@ -115,12 +119,15 @@ class Pool:
 
     def begin(self, job: TrialJob) -> None:
         """Hand a trial to a worker."""
-        actor = self.idle.pop() if self.idle else self._worker()
-        self.busy[job["key"]] = Taken(job, actor)
-        self.waiting[actor.begin.remote(job)] = job["key"]
+        self.busy[job["key"]] = taken = Taken(job, self.idle.pop() if self.idle else None)
+        self._hand_over(taken)
 
-    def _worker(self) -> Any:
-        return ray.remote(Worker).options(num_cpus=self.cpus).remote()
+    def _hand_over(self, taken: Taken) -> None:
+        """Let the trial's actor begin with it, a new one if it has none."""
+        if taken.actor is None:
+            taken.actor = ray.remote(Worker).options(num_cpus=self.cpus).remote()
+            taken.room = taken.actor.ready.remote()
+        self.waiting[taken.actor.begin.remote(taken.job)] = taken.job["key"]
 
     def next(self, timeout: float) -> dict[str, dict[str, Any] | Failed]:
         """Results that have come, by key; empty if none comes in `timeout` seconds. Call `go_on` or `end` for each.
@@ -148,8 +155,8 @@ class Pool:
         if taken.deaths.left <= 0:
             del self.busy[key]
             return Failed("the worker died", text)
-        taken.actor, taken.seen, taken.place = self._worker(), 0, None
-        self.waiting[taken.actor.begin.remote(taken.job)] = key
+        taken.actor, taken.seen, taken.place = None, 0, None
+        self._hand_over(taken)
         return {"died": True, "points": []}
 
     def go_on(self, key: str) -> None:
@@ -162,4 +169,15 @@ class Pool:
         if taken is not None:
             with suppress(RayError):
                 ray.get(taken.actor.end.remote())
-                self.idle.append(taken.actor)
+                self._spare(taken.actor)
+
+    def _spare(self, actor: Any) -> None:
+        """Give a free worker to a trial whose own one has found no room: it would wait for this one's processors."""
+        for taken in self.busy.values():
+            if taken.room is not None and not ray.wait([taken.room], timeout=0)[0]:
+                self.waiting = {call: key for call, key in self.waiting.items() if key != taken.job["key"]}
+                ray.kill(taken.actor)
+                taken.actor, taken.room = actor, None
+                self._hand_over(taken)
+                return
+        self.idle.append(actor)

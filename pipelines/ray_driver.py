@@ -16,7 +16,7 @@ from ray.exceptions import RayError
 from ray.tune.experiment import Trial
 from ray.tune.search import Searcher
 
-from pipelines.cluster import DEATHS, Deaths, Place, address, knock, outline, survey, travelling
+from pipelines.cluster import DEATHS, Deaths, Place, address, knock, outline, survey, travelling, watched
 from pipelines.recorder import Recorder
 from pipelines.run import RAY_SETTINGS
 from pipelines.store import StoreError, one_line
@@ -80,7 +80,8 @@ def _joined(where: str) -> Iterator[None]:
     with _explained(f"the cluster at RAY_ADDRESS={where}"):
         ray.init(address=where, runtime_env=travelling(RAY_SETTINGS), **QUIET)
     try:
-        yield
+        with watched(ray.get_runtime_context().gcs_address):
+            yield
     finally:
         ray.shutdown()
 

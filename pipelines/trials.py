@@ -288,7 +288,7 @@ class _Standing:
 
 
 def storage_url(home: Home) -> str:
-    """`$OPTUNA_STORAGE`, such as `postgresql+psycopg2://user@host/optuna`, or SQLite in the work folder."""
+    """`$OPTUNA_STORAGE`, such as `postgresql://user@host/optuna`, or SQLite in the work folder."""
     return os.environ.get("OPTUNA_STORAGE") or f"sqlite:///{home.searches}"
 
 

@@ -5,20 +5,22 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import pytest
 from filelock import FileLock
 
 from pipelines import cluster
 from pipelines.bundle import pack
-from pipelines.cluster import DEATHS, NODE_DIED, Deaths, Sight, knock, look, probing, wrong
+from pipelines.cluster import DEATHS, NODE_DIED, Deaths, Sight, here, knock, look, probing, wrong
 from pipelines.export import export_study
 from pipelines.mlflow_tracker import open_existing
 from pipelines.plan import study_card
+from pipelines.ray_driver import Bridge
 from pipelines.run import show_status
 from pipelines.search import Search
 from pipelines.search_run import search_card, show_search
@@ -50,6 +52,10 @@ STUDY = tiny(points=POINTS, arms={arm: setting(lr=rate) for arm, rate in {"slow"
 # An address
 
 
+def port_of(end: socket.socket) -> int:
+    return int(end.getsockname()[1])
+
+
 @contextmanager
 def listener(says: bytes) -> Iterator[str]:
     """The address of something that answers with these bytes."""
@@ -62,13 +68,13 @@ def listener(says: bytes) -> Iterator[str]:
             line.close()
 
         threading.Thread(target=answer, daemon=True).start()
-        yield f"127.0.0.1:{server.getsockname()[1]}"
+        yield f"127.0.0.1:{port_of(server)}"
 
 
 def test_a_cluster_that_is_not_there_is_one_line() -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{free.getsockname()[1]}"
+        address = f"127.0.0.1:{port_of(free)}"
         with pytest.raises(StoreError, match=f"RAY_ADDRESS={address}: .*refused"):
             knock(address)
 
@@ -88,6 +94,22 @@ def test_what_speaks_as_ray_does_is_let_through() -> None:
 def test_rays_client_is_refused() -> None:
     with pytest.raises(StoreError, match=r"RAY_ADDRESS=ray://127.0.0.1:1: only HOST:PORT or auto"):
         knock("ray://127.0.0.1:1")
+
+
+def test_a_head_that_dies_ends_the_launch(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    ended: list[int] = []
+    monkeypatch.setattr("os._exit", ended.append)
+    with (
+        socket.create_server(("127.0.0.1", 0)) as server,
+        cluster.watched(where := f"127.0.0.1:{port_of(server)}", 0.02),
+    ):
+        for _ in range(10):
+            server.accept()[0].close()
+        assert ended == []
+        server.close()
+        wait_for(lambda: ended, "the end")
+    assert ended == [2]
+    assert capsys.readouterr().err == f"rhmc: the cluster at {where} is gone; the same command continues\n"
 
 
 # Nodes
@@ -132,6 +154,58 @@ def test_only_workers_whose_node_lives_count(monkeypatch: pytest.MonkeyPatch) ->
     assert deaths.left == DEATHS - 3
     del living["b"]  # Ray learns later that it died
     assert deaths.left == DEATHS - 2
+
+
+class Listener:
+    """A recorder that remembers what it was told of one run."""
+
+    def __init__(self) -> None:
+        self.logs, self.told = {"key": None}, []
+
+    def __getattr__(self, name: str) -> Callable[..., None]:
+        return lambda *args: self.told.append(name)
+
+
+def lives(deaths: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What a recorder is told while workers die, W, or their node, N, or get further, -, as Tune has it."""
+    monkeypatch.setattr(cluster, "alive", dict)
+    listener = Listener()
+    bridge = Bridge(listener, folder / "stop")  # type: ignore[arg-type]
+    trial = SimpleNamespace(
+        config={"job": {"key": "key"}}, error_file=str(folder / "e"), num_failures=0, max_failures=2
+    )
+    trials: list[Any] = [trial]
+    written, step = Path(trial.error_file), 0
+    written.touch()
+    for death in deaths:
+        if death == "-":
+            step += 1
+            points = [{"step": float(step)}]
+            bridge.on_trial_result(0, trials, trials[0], {"points": points, "done": False, "place": here()})
+            continue
+        trial.num_failures += 1
+        with written.open("a") as file:
+            file.write(f"Failure # {trial.num_failures}\n{NODE_DIED if death == 'N' else 'killed'}\n")
+        recovers = trial.num_failures <= trial.max_failures
+        (bridge.on_trial_recover if recovers else bridge.on_trial_error)(0, trials, trials[0])
+    return [name for name in listener.told if name != "result"]
+
+
+@pytest.mark.parametrize(
+    ("deaths", "end"),
+    [
+        ("WWW", "failed"),
+        ("WW-WW", "died"),
+        ("WW-WWW", "failed"),
+        ("NNNNNN", "died"),
+        ("WNNNW", "died"),
+        ("WNNNWW", "failed"),
+        ("WWN", "lost"),  # Tune is told before whose death it is how many may come
+    ],
+)
+def test_dead_nodes_cost_no_attempt(deaths: str, end: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told = lives(deaths, tmp_path, monkeypatch)
+    assert told == ["died"] * (len(deaths.replace("-", "")) - 1) + [end]
 
 
 # The whole chain

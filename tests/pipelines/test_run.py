@@ -196,6 +196,20 @@ def test_what_another_process_trains_is_waited_for(launch: Launch, shelf: list[M
     assert not recorder.again()  # asked for once
 
 
+def test_a_run_whose_node_died_is_trained_once_more(launch: Launch, shelf: list[MemoryRun]) -> None:
+    recorder = launch()
+    key = recorder.todo()[0].key
+    recorder.start(key)
+    for node in ("host (a)", "host (b)"):
+        recorder.placed(key, node)
+    assert shelf[0].tags["nodes"] == "host (a), host (b)"
+    recorder.lost(key)
+    assert shelf[0].status == "interrupted"
+    assert recorder.again()
+    assert key in [item.key for item in recorder.todo()]
+    assert recorder.failures == {}
+
+
 def test_checkpoints_that_a_killed_launch_left_of_a_finished_run_go(launch: Launch) -> None:
     recorder = launch()
     key, other = [item.key for item in recorder.todo()]
