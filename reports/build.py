@@ -120,6 +120,7 @@ def _whole(results: Results, paper: Paper) -> Report:
     gaps = [] if results.methods else ["Table 1: no methods; `rhmc methods --out` writes them."]
     gaps += [] if results.modules else ["Figures 1 to 3: no networks; `rhmc drawings --out` writes them."]
     gaps += [] if results.scenes else ["Figures 4, 5 and 8: no scenes; `rhmc drawings --out` writes them."]
+    gaps += [] if results.episodes else ["Animations: none; `rhmc render --out` writes them."]
     gaps += results.gaps(paper.arms | {scaling.STUDY: ()})
     title = f"Does it hold? The paper's results, profile {results.profile}"
     pictures, claims = gallery(results, paper), rules.judge(results, paper)

