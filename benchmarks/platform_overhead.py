@@ -36,7 +36,7 @@ from pipelines.trainable import RunTrainable
 ROOT = Path(__file__).parents[1]
 STUDY = Path("studies") / "ablation.yaml"
 RUNS, CONCURRENT = 4, 2
-RATE = 2_500  # environment steps that one run trains a second, evaluation included: only says how long a study to make
+RATE = 3_500  # environment steps that one run trains a second, evaluation included: only says how long a study to make
 Spent = dict[str, list[float]]  # label -> times, wall seconds, processor seconds
 WORKERS = ("training", "evaluation", "build", "checkpoint", "end of training", "animation")
 PARTS = {  # label -> where it is done, and what it grows with
@@ -233,15 +233,29 @@ def launch(side: str, minutes: float, home: Path) -> dict[str, Any]:
 def look(process: "subprocess.Popen[bytes]") -> dict[int, float]:
     """Processor seconds of every process of a session when it was last seen, until the first one ends."""
     seen: dict[int, float] = {}
-    while True:
-        with suppress(subprocess.TimeoutExpired):
-            process.wait(1.0)
-            return seen
-        for one in psutil.process_iter():
-            with suppress(psutil.Error, OSError):
-                if os.getsid(one.pid) == process.pid:
+    try:
+        while True:
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(1.0)
+                return seen
+            for one in session(process.pid):
+                with suppress(psutil.Error):
                     times = one.cpu_times()
                     seen[one.pid] = times.user + times.system
+    except KeyboardInterrupt:
+        for one in session(process.pid):
+            with suppress(psutil.Error):
+                one.kill()
+        process.wait()
+        raise
+
+
+def session(leader: int) -> Iterator[psutil.Process]:
+    """The processes that one started, Ray's among them."""
+    for one in psutil.process_iter():
+        with suppress(psutil.Error, OSError):
+            if os.getsid(one.pid) == leader:
+                yield one
 
 
 def add(spent: list[Spent], label: str) -> list[float]:
@@ -276,18 +290,17 @@ class Account:
         return self.wall * CONCURRENT / self.training - 1
 
 
-def launches(accounts: dict[str, list[Account]]) -> str:
-    """A table of all launches."""
-    head = ["", "training s", "of which evaluation", "wall s", "before the first point", "after the last", "between"]
-    head += ["training, CPU s", *(f"{name}, CPU s" for name in ("the driver", "workers", "Ray's own"))]
-    head += ["beside training, wall", "beside training, CPU"]
-    lines = [f"| {' | '.join(head)} |", "|---" + "|---:" * (len(head) - 1) + "|"]
-    for side, several in accounts.items():
-        for i, a in enumerate(several):
-            seconds = [a.training, a.parts["evaluation"][1], a.wall, a.before, a.after, a.between, a.training_cpu]
-            cells = [f"{side} {i + 1}", *(f"{value:.1f}" for value in (*seconds, *a.cpus.values()))]
-            lines.append(f"| {' | '.join([*cells, f'{a.over_wall:.1%}', f'{a.over_cpu:.1%}'])} |")
-    return "\n".join(lines)
+HEAD = (
+    *("launch", "training s", "of it evaluation", "wall s", "before the first point", "after the last", "between"),
+    *("training, CPU s", "the driver, CPU s", "workers, CPU s", "Ray's own, CPU s", "over, wall", "over, CPU"),
+)
+
+
+def line(name: str, a: Account) -> str:
+    """A launch as a row under `HEAD`; what is over is so beside training, as a share of it."""
+    seconds = [a.training, a.parts["evaluation"][1], a.wall, a.before, a.after, a.between, a.training_cpu]
+    cells = [name, *(f"{value:.1f}" for value in (*seconds, *a.cpus.values()))]
+    return f"| {' | '.join([*cells, f'{a.over_wall:.1%}', f'{a.over_cpu:.1%}'])} |"
 
 
 def parts(several: list[Account]) -> str:
@@ -316,15 +329,26 @@ def main() -> None:
     if args.side:
         {"bare": bare, "platform": platform}[args.side](changes(args.minutes), args.out)
         return
-    accounts: dict[str, list[Account]] = {"bare": [], "platform": []}
-    for _ in range(args.repeats):
-        for side, several in accounts.items():
-            with tempfile.TemporaryDirectory() as folder:
-                several.append(Account(launch(side, args.minutes, Path(folder))))
-    ends = {tuple(account.returns) for several in accounts.values() for account in several}
     print(f"{env_speed.machine()} {os.cpu_count()} cores.\n\n`rhmc {shlex.join(command(changes(args.minutes)))}`\n")
-    print(launches(accounts), parts(accounts["platform"]), sep="\n\n")
-    print(f"\nFinal returns of bare and platform: {'equal' if len(ends) == 1 else f'DIFFERENT, {ends}'}.")
+    print(f"| {' | '.join(HEAD)} |\n|---{'|---:' * (len(HEAD) - 1)}|", flush=True)
+    accounts: dict[str, list[Account]] = {"platform": [], "bare": []}
+    with suppress(KeyboardInterrupt):  # what there is by then is shown
+        for i in range(args.repeats):
+            for side, several in accounts.items():
+                with tempfile.TemporaryDirectory() as folder:
+                    several.append(Account(launch(side, args.minutes, Path(folder))))
+                print(line(f"{side} {i + 1}", several[-1]), flush=True)
+    print(f"\n{parts(accounts['platform'])}\n\n{verdict(accounts)}")
+
+
+def verdict(accounts: dict[str, list[Account]]) -> str:
+    """What the platform takes more than the loop, at the median, and whether both learned the same."""
+    spent = {side: median(a.over_cpu for a in several) for side, several in accounts.items() if several}
+    texts = [f"{side}: {share:.1%} of training's processor seconds" for side, share in spent.items()]
+    if len(spent) == 2:
+        texts.append(f"the difference, which is the platform: {spent['platform'] - spent['bare']:.1%}")
+    ends = {tuple(account.returns) for several in accounts.values() for account in several}
+    return f"Beside training, {'; '.join(texts)}. Final returns: {'equal' if len(ends) == 1 else f'DIFFERENT, {ends}'}."
 
 
 if __name__ == "__main__":

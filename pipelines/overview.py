@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from io import BytesIO, StringIO
 from typing import NamedTuple
 
+from pipelines import legend
 from pipelines.plan import LISTED, Item, more
 from pipelines.tracker import Recorded, Row, Status, StudyCard, Tracker
 from rhmc.types import Metrics
@@ -173,6 +174,7 @@ def figure(study: StudyCard, runs: Sequence[Run]) -> bytes:
     sheet = Figure(figsize=(8, 4.5), layout="constrained")
     FigureCanvasAgg(sheet)
     axes = sheet.add_subplot(xlabel="environment steps", ylabel="return of the evaluation bank")
+    axes.set_prop_cycle(color=[legend.colour(place) for place in range(MOST)])
     curves = {arm: found for arm, mine in by_arm(runs).items() if (found := _common(mine))}
     for arm, (seeds, steps, values) in list(curves.items())[:MOST]:
         axes.plot(steps, [sum(at) / seeds for at in values], lw=1.5, label=f"{arm} ({seeds})")

@@ -106,7 +106,6 @@ def _base(params: Params, legends: Sequence[str]) -> State:
         "runsHiddenMode": "SHOW_ALL",
         "useGroupedValuesInCharts": True,
         "hideEmptyCharts": True,
-        "globalLineChartConfig": {"xAxisKey": "step", "lineSmoothness": 0, "selectedXAxisMetricKey": ""},  # as measured
         "isAccordionReordered": True,  # sections stay in the order that is written here
         "groupBy": None,
     }
@@ -134,7 +133,8 @@ def _width(*texts: str) -> int:
 
 
 def _curves() -> State:
-    lines = [_chart("LINE", CURVES, name, displayPoints=False) for name in HEADLINES]
+    as_measured = {"lineSmoothness": 0, "useGlobalLineSmoothing": False, "displayPoints": False}
+    lines = [_chart("LINE", CURVES, name) | as_measured for name in HEADLINES]
     bars = [_chart("BAR", ENDS, name) for name in FINALS]
     shown = [_section(name, columns=2, cardHeight=LINE_HEIGHT) for name in (CURVES, ENDS)]
     return {"compareRunSections": [*shown, *_folded()], "compareRunCharts": lines + bars}
@@ -158,10 +158,10 @@ def _axes(params: Sequence[str]) -> State:
     return {"selectedParams": list(params), "selectedMetrics": ["final/return"], "showAllRuns": True}
 
 
-def _chart(kind: str, section: str, metric: str, **more: Any) -> State:
+def _chart(kind: str, section: str, metric: str) -> State:
     """A card. Metrics without one get one from MLflow, in the section of their group."""
     fixed = {"type": kind, "uuid": f"rhmc-{kind}-{metric}", "metricSectionId": _section_id(section)}
-    return fixed | {"metricKey": metric, "runsCountToCompare": SHOWN, "deleted": False, "isGenerated": False} | more
+    return fixed | {"metricKey": metric, "runsCountToCompare": SHOWN, "deleted": False, "isGenerated": False}
 
 
 def _section(name: str, **more: int) -> State:

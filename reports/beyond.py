@@ -68,7 +68,8 @@ def fig_assignments(results: Results, study: str) -> Drawing | None:
         names = [f"{arm} ({_count(results, study, arm)})" for arm in arms]
         how: dict[str, Any] = {"ncols": min(4, len(arms)), "frameon": False, "fontsize": 8.5}
         figure.legend(list(handles.values()), names, loc="lower left", bbox_to_anchor=(0.03, 0.07), **how)
-        foot(figure, "mean per state of the training itself, exploration included; band: 95 % bootstrap interval")
+        words = "mean per state of the training itself, exploration included, against environment steps"
+        foot(figure, f"{words}; band: 95 % bootstrap interval, none with one seed")
     columns = ["arm", "quantity", "step", "mean", "low", "high", "n"]
     return Drawing(figure, pd.concat(parts, ignore_index=True)[columns])
 

@@ -25,7 +25,7 @@ MADE = ("figures", "tables", "claims.md", "claims.csv", "claims.json", "index.md
 DEFINITIONS = (
     (
         "Final return",
-        "mean over seeds of final/return, the greedy policy after the last step on a bank of episodes that no curve "
+        "mean over seeds of final/return, the greedy policy after the last step on a bank of {episodes} that no curve "
         "uses. Coverage: 100 × mean reward per step; navigation: sum over an episode.",
     ),
     (
@@ -56,7 +56,7 @@ FIRST = ("navigation", "coverage", "scaling", "ablation")  # studies of the pape
 MORE = ("profile_", "better_", "pairs_", "steadiness_", "yardsticks")
 LAST = ("provenance", "runs")  # tables with a part of their own at the end
 COMPLETE = "Nothing: every planned run is finished."
-DRAWN, PLAYED = "rhmc drawings", "rhmc transfer"
+DRAWN = "rhmc drawings"
 
 
 class Report(NamedTuple):
@@ -133,6 +133,13 @@ def _single(results: Results, paper: Paper, study: str) -> Report:
     title = f"Study {study}, profile {results.profile}"
     lead = f"{_question(results, study)} {_lead(results)}"
     return Report(results, title, lead, study_gallery(results, paper, study), made, [], results.gaps({}), [])
+
+
+def definitions(results: Results) -> list[tuple[str, str]]:
+    """What the words mean, with the size of the final bank."""
+    counts = sorted({n for study in results.studies if (n := results.final_episodes(study))})
+    episodes = f"{' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))} episodes" if counts else "episodes"
+    return [(name, words.replace("{episodes}", episodes)) for name, words in DEFINITIONS]
 
 
 def _write(report: Report, folder: Path) -> None:
@@ -223,7 +230,7 @@ def _index(report: Report) -> Iterator[str]:
             yield f"{table.markdown()}\n"
             yield f"{_links('tables', name, 'CSV', 'LaTeX')}\n"
     yield "## Definitions\n"
-    yield "\n".join(f"- **{name}**: {words}" for name, words in DEFINITIONS) + "\n"
+    yield "\n".join(f"- **{name}**: {words}" for name, words in definitions(results)) + "\n"
     yield "## What is missing\n"
     yield "\n".join(f"- {gap}" for gap in report.gaps) + "\n" if report.gaps else f"{COMPLETE}\n"
     yield "## Runs behind the numbers\n"
@@ -250,11 +257,12 @@ def _content(report: Report, pictures: Path) -> Mapping[str, Any]:
         "gaps": [gap.replace("`", "") for gap in report.gaps],
         "claims": [page.card(claim) for claim in report.claims],
         "sections": _sections(report, pictures),
-        "definitions": DEFINITIONS,
+        "definitions": definitions(results),
         "mixed": results.runs["fingerprint"].dropna().astype(str).replace("", None).nunique() > 1,
         "provenance": page.provenance(results),
         "made": page.grid("provenance", report.tables["provenance"]),
         "runs": page.grid("runs", runs),
+        "counted": "runs" if set(results.runs["study"]) <= set(results.studies) else "runs, with scripted policies",
         "ids": [f"run-{run}" if first else "" for run, first in _first_seen(runs)],
         "foot": f"Built from the exported tables of profile {results.profile}; the same tables give the same page.",
     }
@@ -290,9 +298,8 @@ def _sections(report: Report, pictures: Path) -> list[page.Section]:
 
 def _section(report: Report, pictures: Path, name: str, title: str, study: str, names: Sequence[str]) -> page.Section:
     mine = [picture for picture in report.pictures if picture.study == study]
-    made = PLAYED if study == "-" else DRAWN
-    made = rules.command(study, report.results.profile) if study in report.results.studies else made
-    plates = {p.name: page.plate(p, pictures, made.partition(" && ")[0]) for p in mine}
+    made = rules.command(study, report.results.profile) if study in report.results.studies else DRAWN
+    plates = {p.name: page.plate(p, pictures, p.behind or made.partition(" && ")[0]) for p in mine}
     if not study:
         episodes = [page.episode(task, gif) for task, gif in report.results.episodes.items()]
         plates |= {plate.name: plate for plate in episodes}

@@ -22,6 +22,7 @@ class Picture(NamedTuple):
     alt: str
     drawing: Drawing
     study: str = ""
+    behind: str = ""  # the command that made its numbers, where it is not the study's own
 
     @property
     def heading(self) -> str:
@@ -80,7 +81,8 @@ def comparisons(results: Results) -> Iterator[Picture]:
                 "target ever less often, and whether targets are left to nobody."
             )
             alt = f"Three line charts against environment steps for {joined(beyond.assigning(results, study))}."
-            yield Picture(f"assignments_{study}", title, caption, alt, watched, study)
+            made = f"rhmc assignments studies/{study.partition('@')[0]}.yaml --profile {results.profile}"
+            yield Picture(f"assignments_{study}", title, caption, alt, watched, study, made)
         arms = comparison.compared(results, study)
         profile = comparison.profile(results, study)
         if profile:
@@ -100,7 +102,7 @@ def comparisons(results: Results) -> Iterator[Picture]:
             "targets are added, and where it falls below sensors that each seek their own best window."
         )
         alt = "Two line charts of return against numbers of sensors and of targets."
-        yield Picture("transfer", "Trained once, played with other numbers", caption, alt, moved, "-")
+        yield Picture("transfer", "Trained once, played with other numbers", caption, alt, moved, "-", "rhmc transfer")
 
 
 def curve_caption(results: Results, study: str) -> str:

@@ -28,7 +28,7 @@ def evaluate(
         int | None, typer.Option(min=0, help="Seed of the bank; the run's final bank if not given.")
     ] = None,
     config: Annotated[
-        Path | None, typer.Option(help="Settings of a .pt file; config.yaml beside it if not given.")
+        Path | None, typer.Option(help="Settings of a .pt file, other than it names itself: a config.yaml.")
     ] = None,
     as_json: Json = False,
     overrides: Sets = None,

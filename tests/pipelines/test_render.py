@@ -205,6 +205,11 @@ def test_the_command_draws_a_file(
     }.items():
         assert rhmc(monkeypatch, *words) == 2
         assert capsys.readouterr().err == said
+    study = str(Path(__file__).parents[2] / "studies" / "ablation.yaml")
+    assert rhmc(monkeypatch, study, "--arm", "full", "--out", "b.gif") == 2
+    assert capsys.readouterr().err.startswith("ablation (quick): no such run has a policy yet; ")
+    assert rhmc(monkeypatch, study, "--arm", "ful", "--out", "b.gif") == 2
+    assert "--arm: 'ful' is not allowed; " in capsys.readouterr().err
     assert rhmc(monkeypatch, "policy.pt", "--out", "b.gif", "--beside", "best_windows") == 2
     said = capsys.readouterr().err
     assert said.startswith("--beside: 'best_windows' is not allowed; ")

@@ -1,6 +1,8 @@
 """What a study of thousands of runs must not do again for each of them. Calls are counted, nothing is timed."""
 
 import io
+import sqlite3
+from contextlib import closing
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -10,7 +12,7 @@ from ray.tune.experiment import Experiment
 from ray.tune.search import SearchGenerator
 from rich.console import Console
 
-from pipelines.mlflow_tracker import LONGEST, NOTE, MlflowTracker, fitting
+from pipelines.mlflow_tracker import LONGEST, NOTE, MlflowTracker, addresses, fitting
 from pipelines.overview import Run, so_far
 from pipelines.plan import LISTED, Item, study_card
 from pipelines.progress import PlainBoard
@@ -123,6 +125,29 @@ def test_the_summary_reads_one_value_of_each_run(log: Asked) -> None:
     runs: list[Item] = plan()
     assert _arms(runs, log) == [["slow", "1 of 1", "2.00"], ["fast", "1 of 1", "2.00"]]
     assert len(log.read) == len(runs)
+
+
+def filled(home: Path) -> set[str]:
+    """The tables of which SQLite knows how they are filled."""
+    with closing(sqlite3.connect(home / "mlflow.db")) as database:
+        if not database.execute("SELECT 1 FROM sqlite_master WHERE name = 'sqlite_stat1'").fetchall():
+            return set()
+        return {table for (table,) in database.execute("SELECT tbl FROM sqlite_stat1")}
+
+
+def test_sqlite_knows_how_to_find_the_metrics_of_some_runs(home: Path) -> None:
+    tracker = MlflowTracker(STUDY, Home(home))
+    assert "metrics" not in filled(home)
+    tracker.start(plan()[0].card).log([{"step": 0.0, "eval/return": 1.0}])
+    tracker.publish("So far.", {})
+    assert filled(home) >= {"metrics", "latest_metrics", "tags"}
+
+
+def test_so_it_does_in_a_store_that_is_only_looked_at(home: Path) -> None:
+    tracker = MlflowTracker(STUDY, Home(home))
+    tracker.start(plan()[0].card).log([{"step": 0.0, "eval/return": 1.0}])
+    addresses(tracker.uri, "http://127.0.0.1:5000")
+    assert "metrics" in filled(home)
 
 
 def test_a_study_of_many_arms_can_be_logged(home: Path) -> None:
