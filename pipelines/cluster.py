@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,6 +27,7 @@ from pipelines.store import StoreError, one_line
 
 KNOCK = 5.0  # seconds to wait for a cluster to answer
 PULSE, MISSES = 8.0, 3  # seconds between two looks at the head, and how many in a row may find nobody
+CODE = "RHMC_CODE"  # a variable that tells workers the driver's fingerprint
 GONE = 2  # exit code where the head is: something is in the way
 ANSWER = 90.0  # seconds to wait for a node to look around: it may start a process and import torch
 DEATHS = 3  # workers that may die in a row on one training without getting it further
@@ -101,7 +103,28 @@ def _refused(where: str, why: str) -> StoreError:
 def travelling(settings: dict[str, str]) -> dict[str, Any]:
     """What a launch brings along to every node: the code that the driver runs, and Ray's settings for workers."""
     folders = [package_folder(), Path(__file__).parent]
-    return {"py_modules": [str(folder) for folder in folders], "env_vars": settings}
+    return {"py_modules": [str(folder) for folder in folders], "env_vars": settings | {CODE: own_code()}}
+
+
+@cache
+def own_code() -> str:
+    """The fingerprint of what this process runs."""
+    return fingerprint()
+
+
+def check_code() -> None:
+    """In a worker: see that it runs what the driver does. A node may have joined after all others were asked.
+
+    Raises:
+        StoreError: it does not.
+    """
+    wanted = os.environ.get(CODE) or own_code()
+    if own_code() != wanted:
+        raise StoreError(f"node {here()} {_other_code(own_code(), wanted)}")
+
+
+def _other_code(found: str, wanted: str) -> str:
+    return f"computes with another torch, numpy or code ({found} instead of {wanted}): install requirements.lock there"
 
 
 # Nodes
@@ -131,7 +154,9 @@ def outline(concurrent: int, cpus: int) -> str:
     """A line on the cluster that was joined, for a launch with `concurrent` runs of `cpus` processors at a time."""
     have = [int(node["Resources"].get("CPU", 0)) for node in alive().values()]
     room = sum(count // cpus for count in have)
-    text = f"cluster at {address()}: {len(have)} nodes, {sum(have)} processors, {min(room, concurrent)} runs at a time"
+    parts = {"node": len(have), "processor": sum(have), "run": min(room, concurrent)}
+    words = ", ".join(f"{count} {name}{'s' * (count != 1)}" for name, count in parts.items())
+    text = f"cluster at {address()}: {words} at a time"
     if not room:
         return f"{text}; waiting for a node that has {cpus} processors for a run"
     return text if room <= concurrent else f"{text} (room for {room}: see resources.concurrent)"
@@ -156,7 +181,7 @@ def look(probe: str, node: str) -> Sight:
         with suppress(Timeout), FileLock(file).acquire(timeout=0):
             locks = False
         file.with_name(f"{file.name}.{node}").touch()
-    return Sight(fingerprint(), torch.backends.cpu.get_cpu_capability(), sees, locks)
+    return Sight(own_code(), torch.backends.cpu.get_cpu_capability(), sees, locks)
 
 
 def survey(home: Path) -> list[str]:
@@ -179,7 +204,7 @@ def survey(home: Path) -> list[str]:
         seen = {node: _answer(node, call) for node, call in calls.items()}
         for node, sight in seen.items():
             written = probe.with_name(f"{probe.name}.{node}").exists()
-            if fault := wrong(sight, home, written=written, code=fingerprint()):
+            if fault := wrong(sight, home, written=written, code=own_code()):
                 raise _refused(address(), f"node {_name(node)} {fault}")
     kinds = Counter(sight.processor for sight in seen.values())
     if len(kinds) < 2:
@@ -222,7 +247,7 @@ def wrong(sight: Sight, home: Path, *, written: bool, code: str) -> str:
     if not sight.locks:
         return f"takes a lock in {home} that the driver holds: mount it with locks that reach every node"
     if sight.code != code:
-        return f"has another torch or numpy ({sight.code} instead of {code}): install requirements.lock there"
+        return _other_code(sight.code, code)
     return ""
 
 

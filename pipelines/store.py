@@ -3,6 +3,7 @@
 import hashlib
 import os
 import shutil
+import socket
 import urllib.parse
 import zipfile
 from collections.abc import Callable, Iterator
@@ -88,7 +89,7 @@ class Home:
             message = f"{study} ({profile}) is already being run by process {pid} ({path}); wait for it or stop it"
             raise StoreError(message) from error
         try:
-            owner.write_text(f"{os.getpid()}\n")
+            owner.write_text(f"{os.getpid()} on {socket.gethostname()}\n")
             yield
         finally:
             lock.release()
@@ -169,7 +170,7 @@ def whole(path: Path, *, durable: bool = False) -> Iterator[Path]:
     Raises:
         StoreError: the disk is full or the folder closed; nothing half-written is left.
     """
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    part = path.with_name(f"{path.name}.{socket.gethostname()}-{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield part

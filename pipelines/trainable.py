@@ -13,7 +13,7 @@ from typing import Any, NotRequired, TypedDict
 from filelock import Timeout
 from ray.tune import Trainable
 
-from pipelines.cluster import here
+from pipelines.cluster import check_code, here
 from pipelines.policy import FILE, SPEC, Saved
 from pipelines.seeds import Seeds
 from pipelines.store import Checkpoints, StoreError, one_line, save_atomically, without_replay
@@ -68,6 +68,7 @@ class RunTrainable(Trainable):
             self.ended = failure(error)
 
     def _begin(self) -> None:
+        check_code()
         Path(self.job["folder"]).parent.mkdir(parents=True, exist_ok=True)
         try:
             self.lock.acquire(timeout=0)

@@ -16,7 +16,7 @@ from filelock import FileLock
 
 from pipelines import cluster
 from pipelines.bundle import pack
-from pipelines.cluster import DEATHS, NODE_DIED, Deaths, Sight, here, knock, look, probing, wrong
+from pipelines.cluster import DEATHS, NODE_DIED, Deaths, Sight, here, knock, look, outline, probing, wrong
 from pipelines.export import export_study
 from pipelines.mlflow_tracker import open_existing
 from pipelines.plan import study_card
@@ -27,6 +27,7 @@ from pipelines.search_run import search_card, show_search
 from pipelines.seeds import Seeds
 from pipelines.store import Home, StoreError
 from pipelines.study import Setting
+from pipelines.trainable import RunTrainable
 from rhmc.types import Metrics
 from tests.pipelines.chaos import everything, faults, launch
 from tests.pipelines.fleet import (
@@ -39,7 +40,7 @@ from tests.pipelines.fleet import (
     tracking_server,
     wait_for,
 )
-from tests.pipelines.support import CODE, setting, tiny
+from tests.pipelines.support import CODE, plan, setting, tiny
 
 PROGRAMS = postgres_programs()
 needs_postgres = pytest.mark.skipif(
@@ -137,7 +138,31 @@ def test_what_a_node_may_lack(tmp_path: Path) -> None:
     assert "RHMC_HOME" in wrong(good._replace(sees=False), tmp_path, written=False, code="c0de")
     assert "cannot write to" in wrong(good, tmp_path, written=False, code="c0de")
     assert "locks that reach every node" in wrong(good._replace(locks=False), tmp_path, written=True, code="c0de")
-    assert "another torch or numpy (c0de instead of 0ther)" in wrong(good, tmp_path, written=True, code="0ther")
+    assert "another torch, numpy or code (c0de instead of 0ther)" in wrong(good, tmp_path, written=True, code="0ther")
+
+
+def test_a_node_that_joined_late_does_not_train_with_other_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (job,) = [{"key": i.key, "spec": i.spec.canonical(), "folder": str(tmp_path / "a")} for i in plan(STUDY)[:1]]
+    config = {"job": job | {"checkpoint_every": 1, "stop": str(tmp_path / "stop")}}
+    for code, trains in ((cluster.own_code(), True), ("0ther", False)):
+        monkeypatch.setenv(cluster.CODE, code)
+        run = RunTrainable(config)
+        result = run.step()
+        run.cleanup()
+        assert ("error" not in result) == trains
+    assert f"({cluster.own_code()} instead of 0ther)" in result["error"]
+
+
+def test_the_line_on_a_cluster(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RAY_ADDRESS", "head:1")
+    nodes = {"a": {"Resources": {"CPU": 8.0}}, "b": {"Resources": {}}, "c": {"Resources": {"CPU": 3.0}}}
+    monkeypatch.setattr(cluster, "alive", lambda: nodes)
+    start = "cluster at head:1: 3 nodes, 11 processors, "
+    assert outline(20, 1) == f"{start}11 runs at a time"
+    assert outline(1, 4) == f"{start}1 run at a time (room for 2: see resources.concurrent)"
+    assert outline(5, 16) == f"{start}0 runs at a time; waiting for a node that has 16 processors for a run"
 
 
 # Deaths

@@ -291,7 +291,9 @@ def test_a_server_is_asked_for_a_metric_of_many_runs_at_once(home: Path, monkeyp
         assert len(found) == 4 * (8 + 16 + 24)
         for most in (17, 1):  # more than an answer holds: some are asked for in halves, some one by one
             monkeypatch.setattr(histories, "VALUES", most)
+            asked.clear()
             assert str(tracker.rows(refs)) == str(found)
+            assert [len(refs) for refs in asked][:5] == ([3, 1, 2, 1, 1] if most == 17 else [3, 1, 1, 2, 1])
         monkeypatch.setattr(histories, "PAGE", "/api/none")  # a server that has no such page
         assert str(tracker.rows(refs)) == str(found)
     finally:
