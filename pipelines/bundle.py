@@ -22,12 +22,14 @@ from pydantic import ValidationError
 from pipelines.export import write_parquet
 from pipelines.fingerprint import fingerprint
 from pipelines.plan import Item, commit, finished, items, resolved_yaml, study_card
+from pipelines.policy import CONFIG, FILE
+from pipelines.recorder import keep
 from pipelines.store import Checkpoints, Home, StoreError, whole
 from pipelines.study import RunSpec, Study
 from pipelines.tracker import Card, Row, StudyCard, Tracker, points_of
 from rhmc.types import Frozen
 
-FORMAT = 1
+FORMAT = 2
 ARCHIVE = ".zip"
 MANIFEST = "bundle.json"
 RUNS = pa.schema(
@@ -52,6 +54,8 @@ class Manifest(Frozen):
     study: str
     profile: str
     note: str
+    params: dict[str, tuple[str, ...]]
+    arms: tuple[str, ...]
     fingerprint: str
     commit: str
 
@@ -145,7 +149,7 @@ def _fill(folder: Path, plan: list[Item], tracker: Tracker | None, home: Home) -
 def _policy(tracker: Tracker, ref: str, file: Path) -> str:
     """Put a run's policy in its place and return its digest, nothing if the log has none."""
     with TemporaryDirectory() as name:
-        kept = tracker.file(ref, "policy.pt", Path(name))
+        kept = tracker.file(ref, FILE, Path(name))
         if kept is None:
             return ""
         file.parent.mkdir(exist_ok=True)
@@ -195,7 +199,7 @@ def unpack(bundle: Path, home: Path) -> Taken:
 
     with _opened(bundle) as folder:
         about, entries = _read(bundle, folder)
-        place, card = Home(home), StudyCard(about.study, about.profile, about.note)
+        place, card = Home(home), StudyCard(about.study, about.profile, about.note, about.params, about.arms)
         place.prepare()
         with place.lock(card.study, card.profile):
             tracker = MlflowTracker(card, place)
@@ -216,10 +220,12 @@ def unpack(bundle: Path, home: Path) -> Taken:
 def _log(tracker: Tracker, study: StudyCard, entry: Entry, folder: Path) -> None:
     log = tracker.start(entry.item.card)
     log.log(points_of(entry.rows))
-    log.text("config.yaml", resolved_yaml(entry.item, study))
+    log.text(CONFIG, resolved_yaml(entry.item, study))
     if entry.policy:
         with TemporaryDirectory() as name:
-            log.artifact(shutil.copyfile(folder / "policies" / f"{entry.item.key}.pt", Path(name) / "policy.pt"))
+            (Path(name) / CONFIG).write_text(resolved_yaml(entry.item, study))  # for a policy without its spec
+            shutil.copyfile(folder / "policies" / f"{entry.item.key}.pt", Path(name) / FILE)
+            keep(log, Path(name))
     log.tag("imported", "yes")
     log.finish("finished")
 

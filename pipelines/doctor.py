@@ -10,7 +10,7 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from pipelines.store import Home, StoreError, one_line
+from pipelines.store import Home, StoreError, one_line, without_password
 
 PYTHON = (3, 11)
 NEEDED = 2 * 2**30  # bytes free: a study of many runs with their checkpoints
@@ -36,7 +36,7 @@ def examine(home: Path, *, ray: bool = True) -> Iterator[Finding]:
         ray: also start Ray, which takes seconds.
     """
     checks: list[Callable[[], Iterable[Finding]]] = [python, libraries, torch_build]
-    checks += [lambda: disk(home), lambda: store(Home(home)), *([starts_ray] if ray else [])]
+    checks += [lambda: disk(home), lambda: store(Home(home)), *([lambda: starts_ray(home)] if ray else [])]
     for check in checks:
         yield from check()
 
@@ -114,12 +114,12 @@ def store(home: Home) -> Iterator[Finding]:
         yield Finding("fault", "store", str(error))
         return
     if runs is None:
-        yield Finding("ok", "store", f"{uri}: nothing logged yet")
+        yield Finding("ok", "store", f"{without_password(uri)}: nothing logged yet")
         return
     from pipelines.fingerprint import fingerprint
 
     here = fingerprint()
-    yield Finding("ok", "store", f"{uri}: {len(runs)} runs")
+    yield Finding("ok", "store", f"{without_password(uri)}: {len(runs)} runs")
     for status in ("running", "interrupted", "failed"):
         where = Counter(run.experiment for run in runs if run.status == status and run.fingerprint == here)
         if where:
@@ -143,18 +143,22 @@ def _places(count: Mapping[str, int]) -> str:
     return ", ".join(names[:SHOWN]) + more
 
 
-def starts_ray() -> list[Finding]:
-    """Whether Ray starts here, or its cluster answers."""
+def starts_ray(home: Path | None = None) -> list[Finding]:
+    """Whether Ray starts here, or its cluster answers and every node can train with this work folder."""
     from pipelines.run import RAY_SETTINGS
 
     os.environ.update({name: os.environ.get(name, value) for name, value in RAY_SETTINGS.items()})
+    from pipelines.cluster import address
     from pipelines.ray_driver import ray_session
 
-    address = os.environ.get("RAY_ADDRESS")
+    there = home if home and home.is_dir() else None
     try:
-        with ray_session(1):
-            pass
+        with ray_session(1, home=there) as remarks:
+            notes = [Finding("note", "ray", remark) for remark in remarks[1:]]
     except StoreError as error:
-        advice = "start that cluster, or unset RAY_ADDRESS" if address else "free memory and /tmp, then try again"
+        advice = "free memory and /tmp, then try again"
+        if address():
+            advice = "mend or start that cluster, or unset RAY_ADDRESS"
         return [Finding("fault", "ray", f"{error}: {advice}")]
-    return [Finding("ok", "ray", f"the cluster at {address} answers" if address else "starts")]
+    able = ", and every node can train" if there else ""
+    return [Finding("ok", "ray", f"the cluster at {address()} answers{able}" if address() else "starts"), *notes]

@@ -10,6 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipelines.fingerprint import fingerprint
+from pipelines.host import Host
 from pipelines.plan import Item, items, study_card
 from pipelines.store import Home, StoreError, whole, work_folder
 from pipelines.study import Study
@@ -43,10 +44,11 @@ RUNS = pa.schema(
         ("seconds", pa.float64()),  # spent training
     ]
 )
+EXPORTED = pa.schema([*RUNS, ("machine", pa.string()), ("versions", pa.string())])  # of a study: what started its runs
 
 
 def export_study(study: Study, out: Path, home: Path | None = None) -> int:
-    """Write `<out>/<study>.parquet` (schema `METRICS`) and `<out>/<study>.runs.parquet` (schema `RUNS`).
+    """Write `<out>/<study>.parquet` (schema `METRICS`) and `<out>/<study>.runs.parquet` (schema `EXPORTED`).
 
     Only runs of the present plan and code are taken; `time/` metrics stay behind, but for the seconds of a run.
 
@@ -88,7 +90,7 @@ def write_tables(study: Study, plan: list[Item], tracker: Tracker | None, out: P
         values += [(*place, r.step, r.metric, r.value) for r in rows if not r.metric.startswith("time/")]
         runs.append((*place, *_about(study, item, run, rows)))
     write_parquet(out / f"{study.name}.parquet", METRICS, sorted(values, key=lambda row: row[:6]))
-    write_parquet(out / f"{study.name}.runs.parquet", RUNS, sorted(runs, key=lambda row: row[:4]))
+    write_parquet(out / f"{study.name}.runs.parquet", EXPORTED, sorted(runs, key=lambda row: row[:4]))
     return sum(1 for _, run in there if run is None or run.status != "finished")
 
 
@@ -97,7 +99,7 @@ def _about(study: Study, item: Item, run: Recorded | None, rows: list[Row]) -> t
     seconds = max((row.value for row in rows if row.metric == "time/seconds"), default=0.0)
     card, commit = item.card, run.commit if run else ""
     names = (status, card.algorithm, card.task, study.profile, item.spec.canonical(), card.fingerprint, commit)
-    return (*names, study.question, seconds)
+    return (*names, study.question, seconds, *(run.host if run else Host()))
 
 
 def write_parquet(path: Path, schema: pa.Schema, rows: list[tuple[object, ...]]) -> None:

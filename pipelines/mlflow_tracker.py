@@ -3,6 +3,7 @@
 One experiment per study and profile, in it one parent run for the study and one nested run per arm and key.
 """
 
+import json
 import logging
 import os
 import sqlite3
@@ -13,20 +14,23 @@ import urllib.request
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
+from http.client import HTTPException
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from filelock import FileLock
 
-from pipelines import names, views
+from pipelines import legend, names, views
 from pipelines.errors import InputError
-from pipelines.store import Home, StoreError, one_line, replace_durably, sync
+from pipelines.host import Host
+from pipelines.store import Home, StoreError, one_line, replace_durably, sync, without_password
 from pipelines.tracker import Card, Recorded, Row, Status, StudyCard, unseen
 from rhmc.types import Metrics
 
 os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
 os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
+os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")  # the launch says where to look itself
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "4")  # 28 s: a server that was killed is back by then
 
 from mlflow import MlflowClient
@@ -41,11 +45,14 @@ STATUS: dict[Status, str] = {
     "interrupted": "KILLED",
 }
 FROM_MLFLOW: dict[str, Status] = {theirs: ours for ours, theirs in STATUS.items()}
+SERVER = ("http://", "https://")  # how the address of one begins
 BATCH = 1000  # values that one request may carry
 PARENT = "study"  # tag `role` of the parent run; its runs have `run`
 PATIENCE = 20.0  # seconds that a reader waits for a writer of SQLite, as MLflow's own do
 NOTE = "mlflow.note.content"  # the tag that MLflow shows as a description
 LONGEST = 8000  # characters of a run's tag
+ARMS = "arms"  # the experiment's tag with its arms as JSON, in the order in which they came: it decides their colours
+COLOURED = 100  # arms that the tag has room for; a view shows no more
 
 
 def tracking_uri(home: Home) -> str:
@@ -80,6 +87,7 @@ class MlflowTracker:
                 create_database(sqlite_file(self.uri))
             self.client = MlflowClient(self.uri, self.uri)
             self.experiment = self._experiment(home, write)
+            self.arms = self._colour_arms() if write else []
             self.parent = self._parent() if write else None
             if write:
                 self._interrupt_running()
@@ -88,7 +96,7 @@ class MlflowTracker:
         name = experiment_name(self.study)
         found = self.client.get_experiment_by_name(name)
         if found is None and write:
-            return self._create_experiment(name, home.artifacts.as_uri() if self.uri.startswith("sqlite:") else None)
+            return self._create_experiment(name, None if self.served else home.artifacts.as_uri())
         if found is not None and found.lifecycle_stage != "active":
             if not write:
                 return None
@@ -104,18 +112,43 @@ class MlflowTracker:
                 raise
             return found.experiment_id
 
+    def _colour_arms(self) -> list[str]:
+        """The arms that have colours: those that had one keep it, for it is in the names of their runs' groups."""
+        assert self.experiment is not None
+        known: list[str] = json.loads(self.client.get_experiment(self.experiment).tags.get(ARMS, "[]"))
+        arms = [*known, *(arm for arm in self.study.arms if arm not in known)][:COLOURED]
+        if arms != known:
+            self.client.set_experiment_tag(self.experiment, ARMS, json.dumps(arms, ensure_ascii=False))
+        for run in self._search(f"tags.role = 'run' and tags.{legend.TAG} IS NULL"):  # of an earlier version
+            look = self._look(run.data.tags.get("variant", ""), arms)
+            self.client.log_batch(run.info.run_id, tags=[RunTag(*pair) for pair in look])
+        return arms
+
+    @staticmethod
+    def _look(arm: str, arms: Sequence[str]) -> list[tuple[str, str]]:
+        """Tags that say how the runs of an arm are shown."""
+        if arm not in arms:
+            return [(legend.TAG, arm)]
+        place = arms.index(arm)
+        return [(legend.TAG, legend.legend(arm, place)), (legend.COLOUR, legend.colour(place))]
+
     def _parent(self) -> str:
         ref = self._only("tags.role = 'study'", self.study.study, {"role": PARENT}).info.run_id
         assert self.experiment is not None
         self._describe(ref, self.study.note)
-        save_views(self.client, self.client.get_experiment(self.experiment), self.study.params)
+        experiment = self.client.get_experiment(self.experiment)
+        legends = [dict(self._look(arm, self.arms))[legend.TAG] for arm in self.study.arms]
+        save_views(self.client, experiment, views.views(self.study.params, legends))
         self.client.update_run(ref, "RUNNING")
         return ref
 
     def _describe(self, ref: str, note: str) -> None:
+        """Show the note, with the saved views in its first paragraph: all that MLflow shows of it unasked."""
         assert self.experiment is not None
-        self.client.set_experiment_tag(self.experiment, NOTE, fitting(note))
-        self.client.set_tag(ref, NOTE, fitting(note))
+        first, gap, rest = note.partition("\n\n")
+        note = fitting(f"{first} {views.links(self.experiment)}{gap}{rest}")
+        self.client.set_experiment_tag(self.experiment, NOTE, note)
+        self.client.set_tag(ref, NOTE, note)
 
     def _only(self, query: str, name: str, tags: dict[str, str], variant: str | None = None) -> Run:
         """The one run that matches, made if there is none.
@@ -195,6 +228,14 @@ class MlflowTracker:
             (e, _recorded(ref, status, tags)) for (e, ref, status), tags in runs.items() if tags.get("role") == "run"
         ]
 
+    def mark(self, ref: str, *, stale: bool) -> None:
+        """See `Tracker`."""
+        with explained(self.uri):
+            if stale:
+                self.client.set_tag(ref, views.STALE, "yes")
+            else:
+                self.client.delete_tag(ref, views.STALE)
+
     def start(self, card: Card) -> "MlflowRun":
         """See `Tracker`."""
         query = f"tags.role = 'run' and tags.spec = '{card.spec_id}' and tags.fingerprint = '{card.fingerprint}'"
@@ -212,37 +253,44 @@ class MlflowTracker:
         return MlflowRun(self, card, ref, seen)
 
     def _tags(self, card: Card) -> dict[str, str]:
-        return {
-            "role": "run",
-            "mlflow.parentRunId": self.parent or "",
-            "variant": card.arm,
-            "algorithm": card.algorithm,
-            "task": card.task,
-            "seed": str(card.seed),
-            "spec": card.spec_id,
-            "fingerprint": card.fingerprint,
-            "commit": card.commit,
-        }
+        return (
+            dict(self._look(card.arm, self.arms))
+            | {
+                "role": "run",
+                "mlflow.parentRunId": self.parent or "",
+                "variant": card.arm,
+                "algorithm": card.algorithm,
+                "task": card.task,
+                "seed": str(card.seed),
+                "spec": card.spec_id,
+                "fingerprint": card.fingerprint,
+                "commit": card.commit,
+            }
+            | {name: value for name, value in card.host._asdict().items() if value}
+        )
 
     def rows(self, refs: Sequence[str], metrics: Collection[str] | None = None) -> list[Row]:
-        """See `Tracker`. One query for each run where the store is SQLite, else a request per run and metric."""
+        """See `Tracker`. SQLite: a query per run; otherwise a request per metric and a hundred runs."""
         with explained(self.uri):
             found = (self._rows_sqlite if self.uri.startswith("sqlite:") else self._rows_client)(refs, metrics)
             return sorted(found)
 
     def _rows_client(self, refs: Sequence[str], metrics: Collection[str] | None = None) -> Iterator[Row]:
-        for ref in refs:
-            for metric in self.client.get_run(ref).data.metrics:
-                if metrics is not None and names.full(metric) not in metrics:
-                    continue
-                first: dict[int, float] = {}
-                for value in self.client.get_metric_history(ref, metric):
-                    first.setdefault(value.step, value.value)
-                yield from (Row(ref, step, names.full(metric), value) for step, value in first.items())
+        from pipelines.histories import Histories
+
+        first: dict[tuple[str, int, str], float] = {}
+        for one in Histories(self.client, self.uri).of(self._runs(refs), keys_of(metrics)):
+            first.setdefault((one.ref, one.step, names.full(one.metric)), one.value)
+        return (Row(*place, value) for place, value in first.items())
+
+    def _runs(self, refs: Sequence[str]) -> Iterator[Run]:
+        """The runs of these names, of whatever study."""
+        mine = {run.info.run_id: run for run in self._search("tags.role = 'run'")} if len(refs) > 1 else {}
+        return (mine[ref] if ref in mine else self.client.get_run(ref) for ref in refs)
 
     def _rows_sqlite(self, refs: Sequence[str], metrics: Collection[str] | None = None) -> Iterator[Row]:
         """The client's answer, read from MLflow's table `metrics` at once."""
-        keys = sorted({name for metric in metrics or () for name in (metric, names.shown(metric))})
+        keys = sorted(keys_of(metrics) or ())
         some = f" AND key IN ({', '.join('?' * len(keys))})" if metrics is not None else ""
         query = f"SELECT step, key, value, is_nan FROM metrics WHERE run_uuid = ?{some} ORDER BY timestamp"
         with closing(connect(sqlite_file(self.uri))) as database:
@@ -284,7 +332,12 @@ class MlflowTracker:
 
     def where(self) -> str:
         """How to look at the experiment: a command, or a server's address."""
-        return self.uri if self.uri.startswith(("http://", "https://")) else "rhmc ui"
+        return without_password(self.uri) if self.served else "rhmc ui"
+
+    @property
+    def served(self) -> bool:
+        """Whether a server keeps the log, and its files."""
+        return self.uri.startswith(SERVER)
 
 
 class MlflowRun:
@@ -354,6 +407,11 @@ def fitting(note: str) -> str:
     return note if len(note) <= LONGEST else note[: LONGEST - len(cut)].rpartition("\n")[0] + cut
 
 
+def keys_of(metrics: Collection[str] | None) -> set[str] | None:
+    """What metrics of the program may be called in MLflow; None for all."""
+    return None if metrics is None else {name for metric in metrics for name in (metric, names.shown(metric))}
+
+
 def addresses(uri: str, server: str) -> list[tuple[str, str, str]]:
     """The saved views of every study in the web interface: experiment, view and address.
 
@@ -373,21 +431,25 @@ def addresses(uri: str, server: str) -> list[tuple[str, str, str]]:
 
 
 def _views_of(client: MlflowClient, experiment: Experiment) -> list[views.View]:
-    there = views.views([])
+    there = views.views({})
     if all(view.tag in experiment.tags for view in there):
         return there
     runs = client.search_runs([experiment.experiment_id], "tags.role = 'run'", max_results=100)
-    return save_views(client, experiment, list(dict.fromkeys(name for run in runs for name in run.data.params)))
-
-
-def save_views(client: MlflowClient, experiment: Experiment, params: Sequence[str]) -> list[views.View]:
-    """Write the saved views of an experiment whose runs differ in `params`, where they are not as they should be."""
+    params: dict[str, list[str]] = defaultdict(list)
+    for run in runs:
+        mine = params[run.data.params.get("method", "")]
+        mine += [name for name in run.data.params if name not in (*mine, "method")]
     wanted = views.views(params)
+    save_views(client, experiment, wanted)
+    return wanted
+
+
+def save_views(client: MlflowClient, experiment: Experiment, wanted: Sequence[views.View]) -> None:
+    """Write the saved views of an experiment where they are not as they should be."""
     for view in wanted:
         written = view.written(experiment.creation_time or 0)
         if experiment.tags.get(view.tag) != written:
             client.set_experiment_tag(experiment.experiment_id, view.tag, written)
-    return wanted
 
 
 def fetch(ref: str, wanted: Sequence[str], home: Home, folder: Path) -> list[str]:
@@ -453,7 +515,8 @@ def open_existing(study: StudyCard, home: Home) -> MlflowTracker | None:
 def _recorded(ref: str, status: str, tags: Mapping[str, str]) -> Recorded:
     known: dict[str, str] = defaultdict(str, tags)
     key = f"{known['spec']}-{known['fingerprint']}"
-    return Recorded(ref, known["variant"], key, FROM_MLFLOW[status], known["commit"])
+    stale, host = views.STALE in tags, Host(known["machine"], known["versions"])
+    return Recorded(ref, known["variant"], key, FROM_MLFLOW[status], known["commit"], stale, host)
 
 
 # What may be in the way
@@ -478,8 +541,10 @@ def check(uri: str) -> None:
     """
     if uri.startswith("sqlite:"):
         _check_file(sqlite_file(uri))
-    elif uri.startswith(("http://", "https://")):
+    elif uri.startswith(SERVER):
         _check_server(uri)
+    elif "://" not in uri:
+        raise StoreError(f"MLFLOW_TRACKING_URI={uri}: not an address; http://HOST:PORT and sqlite:///FILE are some")
 
 
 def _check_file(path: Path) -> None:
@@ -532,13 +597,16 @@ def create_database(path: Path) -> None:
 
 
 def _check_server(uri: str) -> None:
+    place = urllib.parse.urlsplit(uri)
+    bare = place._replace(netloc=place.netloc.rpartition("@")[2]).geturl()  # this page asks for no name
     try:
-        urllib.request.urlopen(f"{uri.rstrip('/')}/health", timeout=10).close()
+        urllib.request.urlopen(f"{bare.rstrip('/')}/health", timeout=10).close()
     except urllib.error.HTTPError:
         pass  # it answers; a server behind a gateway may lack this page
-    except OSError as error:
+    except (OSError, HTTPException) as error:
         reason: Any = getattr(error, "reason", error)
-        raise StoreError(f"{uri}: the MLflow server does not answer ({reason}); see MLFLOW_TRACKING_URI") from error
+        shown = without_password(uri)
+        raise StoreError(f"{shown}: the MLflow server does not answer ({reason}); see MLFLOW_TRACKING_URI") from error
 
 
 @contextmanager
@@ -549,4 +617,4 @@ def explained(uri: str) -> Iterator[None]:
     except StoreError:
         raise
     except (MlflowException, SQLAlchemyError, sqlite3.Error, OSError, ImportError) as error:
-        raise StoreError(f"{uri}: MLflow cannot go on: {one_line(error)}") from error
+        raise StoreError(f"{without_password(uri)}: MLflow cannot go on: {one_line(error)}") from error

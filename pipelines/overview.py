@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from io import BytesIO, StringIO
 from typing import NamedTuple
 
+from pipelines import legend
 from pipelines.plan import LISTED, Item, more
 from pipelines.tracker import Recorded, Row, Status, StudyCard, Tracker
 from rhmc.types import Metrics
@@ -78,7 +79,7 @@ class Overview:
 
     def describe(self) -> None:
         """Refresh the description alone."""
-        self.tracker.publish(f"{self.study.note}\n\n{so_far(list(self.runs.values()))}", {})
+        self.tracker.publish(self._note(list(self.runs.values())), {})
 
     def publish(self) -> None:
         """Refresh the description, the figure and the table."""
@@ -87,7 +88,12 @@ class Overview:
         files = {TABLE: table(runs).encode()}
         if any(run.curve for run in runs):
             files[FIGURE] = figure(self.study, runs)
-        self.tracker.publish(f"{self.study.note}\n\n{so_far(runs)}", files)
+        self.tracker.publish(self._note(runs), files)
+
+    def _note(self, runs: Sequence[Run]) -> str:
+        """The question, what is known by now, and the rest of the study's own note."""
+        question, _, rest = self.study.note.partition("\n\n")
+        return f"{question}\n\n{so_far(runs)}\n\n{rest}".rstrip()
 
 
 def by_arm(runs: Iterable[Run]) -> dict[str, list[Run]]:
@@ -168,6 +174,7 @@ def figure(study: StudyCard, runs: Sequence[Run]) -> bytes:
     sheet = Figure(figsize=(8, 4.5), layout="constrained")
     FigureCanvasAgg(sheet)
     axes = sheet.add_subplot(xlabel="environment steps", ylabel="return of the evaluation bank")
+    axes.set_prop_cycle(color=[legend.colour(place) for place in range(MOST)])
     curves = {arm: found for arm, mine in by_arm(runs).items() if (found := _common(mine))}
     for arm, (seeds, steps, values) in list(curves.items())[:MOST]:
         axes.plot(steps, [sum(at) / seeds for at in values], lw=1.5, label=f"{arm} ({seeds})")

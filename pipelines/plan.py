@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedSeq
 
+from pipelines.host import Host
 from pipelines.study import RunSpec, Study, changes
 from pipelines.tracker import Card, Recorded, StudyCard
 
@@ -34,8 +36,8 @@ class Item(NamedTuple):
         return self.card.key
 
 
-def items(study: Study, fingerprint: str, commit: str) -> list[Item]:
-    """The runs of a study, in its order."""
+def items(study: Study, fingerprint: str, commit: str, where: Host | None = None) -> list[Item]:
+    """The runs of a study, in its order. where: what starts them, for those that are about to be."""
     runs = study.runs()
     varying = what_varies([run.spec for run in runs])
     planned = []
@@ -44,7 +46,7 @@ def items(study: Study, fingerprint: str, commit: str) -> list[Item]:
         algorithm, task = spec.algo.kind, spec.env.kind
         params = {"method": algorithm} | {name: str(flat[name]) for name in varying if name in flat and name != KIND}
         params |= {"seed": str(spec.seed)}
-        card = Card(run.arm, spec.seed, spec.id, fingerprint, algorithm, task, commit, params)
+        card = Card(run.arm, spec.seed, spec.id, fingerprint, algorithm, task, commit, params, host=where or Host())
         planned.append(Item(card, spec, study.name))
     return planned
 
@@ -73,14 +75,20 @@ def study_card(study: Study) -> StudyCard:
     arms = list(dict.fromkeys(run.arm for run in runs))
     seeds = sorted({run.spec.seed for run in runs})
     steps = sorted({run.spec.trainer.steps for run in runs})
-    params = [name for name in what_varies([run.spec for run in runs]) if name not in (KIND, "seed")]
     budget = ", ".join(f"{count:,}" for count in steps)
     note = (
         f"{study.question}\n\n"
         f"Profile `{study.profile}`: {len(arms)} arms × {len(seeds)} seeds, {budget} environment steps each.\n\n"
         + "\n".join([*(f"- **{arm}**: {_differs(study, arm)}" for arm in arms[:LISTED]), *more(arms)])
     )
-    return StudyCard(study.name, study.profile, note, ("method", *params, "seed"))
+    return StudyCard(study.name, study.profile, note, _varying([run.spec for run in runs]), arms)
+
+
+def _varying(specs: Sequence[RunSpec]) -> dict[str, list[str]]:
+    """What varies between runs, as far as the runs of each method have it."""
+    names = [name for name in what_varies(specs) if name != KIND]
+    flats = {spec.algo.kind: flatten(spec.model_dump(mode="json")) for spec in specs}
+    return {method: [name for name in names if name in flat] for method, flat in flats.items()}
 
 
 def more(arms: Sequence[str]) -> list[str]:
@@ -104,8 +112,18 @@ def resolved_yaml(item: Item, study: StudyCard) -> str:
     head = {"study": study.study, "profile": study.profile, "arm": item.card.arm}
     names = {"spec_id": item.card.spec_id, "fingerprint": item.card.fingerprint, "commit": item.card.commit}
     out = StringIO()
-    YAML().dump(head | names | item.spec.model_dump(mode="json"), out)
+    YAML().dump(head | names | _lists_on_a_line(item.spec.model_dump(mode="json")), out)
     return out.getvalue()
+
+
+def _lists_on_a_line(tree: Any) -> Any:
+    if isinstance(tree, dict):
+        return {name: _lists_on_a_line(value) for name, value in tree.items()}
+    if not isinstance(tree, list):
+        return tree
+    line = CommentedSeq(tree)
+    line.fa.set_flow_style()
+    return line
 
 
 def commit() -> str:

@@ -1,6 +1,7 @@
 """A trained policy, read from its file and ready to act as it does in evaluation."""
 
 import json
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,10 +11,10 @@ from ruamel.yaml import YAML, YAMLError
 from torch import Generator, Tensor
 
 from pipelines.errors import InputError
-from pipelines.store import one_line, save_atomically, without_replay
+from pipelines.store import load_whole, one_line, save_atomically, without_replay
 from pipelines.study import RunSpec
 from rhmc.algorithms import ALGORITHMS
-from rhmc.envs import ENVS
+from rhmc.envs import ENVS, EnvConfig
 from rhmc.types import Batch, Carry, Obs, Spec, State
 
 FILE, CONFIG = "policy.pt", "config.yaml"  # what a run keeps
@@ -25,6 +26,7 @@ class Saved(NamedTuple):
 
     spec: RunSpec
     algorithm: State
+    reached: str = "finished"  # or how far the run has got
 
 
 class Actor:
@@ -32,16 +34,19 @@ class Actor:
 
     Args:
         saved: whose policy.
+        env: the task to act in, with other numbers of agents and targets maybe; the run's own if None.
+        device: where to act.
 
     Raises:
-        ValueError: the state is not one of this method, or was saved by code that differs too much from this.
+        ValueError: the state is not one of this method in this task, or was saved by code that differs too much.
     """
 
-    def __init__(self, saved: Saved) -> None:
-        spec, state = saved
-        self.env, self.sizes = spec.env, sizes(spec)
+    def __init__(self, saved: Saved, env: EnvConfig | None = None, device: str = "cpu") -> None:
+        spec, state = saved.spec, saved.algorithm
+        self.env = env or spec.env
+        self.sizes = sizes(self.env)
         method = ALGORITHMS[spec.algo.kind]
-        rng = Generator()
+        rng = Generator(device)
         with torch.random.fork_rng(devices=[]):  # building draws weights, which are then replaced
             self.algorithm = method.build(spec.algo, self.sizes, spec.trainer.num_envs, rng)
         fresh = {"rng": rng.get_state()} if "rng" in state else {}  # of this device; acting greedily draws nothing
@@ -49,7 +54,7 @@ class Actor:
             self.algorithm.load_state_dict(state | fresh)
         except (KeyError, RuntimeError, TypeError, AttributeError, ValueError) as error:
             raise ValueError(f"no state of '{spec.algo.kind}' as this code has it ({one_line(error)})") from error
-        self.rng = Generator().manual_seed(0)
+        self.rng = Generator(device).manual_seed(0)
         self.carry: Carry = {}
         self.batch = 0
 
@@ -67,29 +72,30 @@ class Actor:
         return action, extra
 
 
-def sizes(spec: RunSpec) -> Spec:
-    """Sizes of a run's task."""
-    return ENVS[spec.env.kind][1].spec(spec.env)
+def sizes(env: EnvConfig) -> Spec:
+    """Sizes of a task."""
+    return ENVS[env.kind][1].spec(env)
 
 
-def load(path: Path) -> Saved:
-    """Read `policy.pt`, a training checkpoint, or the newest such file of a folder.
+# Files
 
-    A file says itself which run it is of; for one that does not (kept by an earlier version) `config.yaml` beside it
-    is read.
+
+def load(path: Path, spec: RunSpec | None = None) -> Saved:
+    """Read `policy.pt`, a training checkpoint, or the policy of a folder: the newest checkpoint that is whole.
+
+    Args:
+        path: the file or folder; nothing in it is changed.
+        spec: which run it is of. If None, the file says it; for a file that does not (kept by an earlier version)
+            `config.yaml` beside it does.
 
     Raises:
         InputError: there is none, it cannot be read, or nothing says which run it is of.
     """
-    file = _file(path)
-    try:
-        state = torch.load(file, weights_only=True, map_location="cpu")
-    except Exception as error:  # cut short, or not a checkpoint: torch raises several kinds
-        raise InputError(f"{file}: not a readable checkpoint ({one_line(error)})") from error
-    inner = state.get("trainer", state) if isinstance(state, dict) else {}
-    if not isinstance(inner, dict) or "algorithm" not in inner:
-        raise InputError(f"{file}: a PyTorch file, but not a checkpoint of a run")
-    return Saved(_spec(file, state.get(SPEC)), inner["algorithm"])
+    files = _files(path)
+    for file in files[:-1]:  # the newest may be damaged, or on its way
+        with suppress(InputError):
+            return _read(file, spec)
+    return _read(files[-1], spec)
 
 
 def save(path: Path, saved: Saved) -> None:
@@ -101,24 +107,65 @@ def save(path: Path, saved: Saved) -> None:
     save_atomically(path, {SPEC: saved.spec.canonical(), "algorithm": without_replay(saved.algorithm)})
 
 
-def _file(path: Path) -> Path:
+def settings(config: Path) -> tuple[RunSpec, str]:
+    """The run that a `config.yaml` describes, and its arm.
+
+    Raises:
+        InputError: there is none, or it is something else.
+    """
+    try:
+        tree = YAML(typ="safe", pure=True).load(config.read_text(encoding="utf-8"))
+        return _spec(tree), str(tree.get("arm", "policy"))
+    except FileNotFoundError as error:
+        raise InputError(f"{config}: no such file; --config names the config.yaml that the run keeps") from error
+    except (OSError, YAMLError, *NO_SPEC) as error:
+        raise InputError(f"{config}: not the config.yaml of a run ({one_line(error)})") from error
+
+
+NO_SPEC = (ValidationError, ValueError, KeyError, TypeError, AttributeError)  # what `_spec` may raise
+
+
+def _spec(fields: Any) -> RunSpec:
+    if missing := [name for name in RunSpec.model_fields if name not in fields]:
+        raise ValueError(f"{missing[0]}: missing")
+    return RunSpec.model_validate({name: fields[name] for name in RunSpec.model_fields})
+
+
+def _files(path: Path) -> list[Path]:
     if not path.is_dir():
-        if not path.exists():
-            raise InputError(f"{path}: no such file")
-        return path
+        return [path]
     found = [path / FILE] if (path / FILE).exists() else sorted(path.glob("[0-9]*.pt"), reverse=True)
     if not found:
         raise InputError(f"{path}: no {FILE} and no checkpoint in this folder")
-    return found[0]
+    return found
 
 
-def _spec(file: Path, written: str | None) -> RunSpec:
-    config = file.parent / CONFIG
-    if written is None and not config.exists():
-        raise InputError(f"{file}: does not say which run it is of, and there is no {CONFIG} beside it")
+def _read(file: Path, spec: RunSpec | None) -> Saved:
     try:
-        fields: Any = json.loads(written) if written is not None else YAML(typ="safe").load(config)
-        return RunSpec.model_validate({name: fields[name] for name in RunSpec.model_fields})
-    except (ValidationError, YAMLError, ValueError, KeyError, TypeError, OSError) as error:
-        source = file if written is not None else config
-        raise InputError(f"{source}: not the settings of a run that this code knows ({one_line(error)})") from error
+        state = load_whole(file)
+    except FileNotFoundError as error:
+        raise InputError(f"{file}: no such file") from error
+    except Exception as error:  # cut short, or not a checkpoint: zipfile, pickle and torch raise several kinds
+        raise InputError(f"{file}: not a readable checkpoint") from error
+    inner = state.get("trainer", state) if isinstance(state, dict) else {}
+    if not isinstance(inner, dict) or "algorithm" not in inner:
+        raise InputError(f"{file}: readable, but not a checkpoint of a run")
+    spec = spec or _told(file, state.get(SPEC))
+    return Saved(spec, inner["algorithm"], _reached(spec, inner))
+
+
+def _told(file: Path, written: str | None) -> RunSpec:
+    """The run that a file says it is of."""
+    if written is None:
+        if not (config := file.parent / CONFIG).exists():
+            raise InputError(f"{file}: does not say which run it is of, and there is no {CONFIG} beside it")
+        return settings(config)[0]
+    try:
+        return _spec(json.loads(written))
+    except NO_SPEC as error:
+        raise InputError(f"{file}: not the settings of a run that this code knows ({one_line(error)})") from error
+
+
+def _reached(spec: RunSpec, inner: State) -> str:
+    under_way = "point" in inner and inner["point"] < spec.trainer.evaluations
+    return f"at step {inner['step']:,}" if under_way else "finished"

@@ -3,9 +3,8 @@
 import logging
 import os
 import shutil
-import socket
 import tempfile
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,26 +12,17 @@ from typing import Any
 
 import ray
 from ray import tune
+from ray.exceptions import RayError
 from ray.tune.experiment import Trial
 from ray.tune.search import Searcher
 
+from pipelines.cluster import DEATHS, Deaths, Place, address, knock, outline, survey, travelling, watched
 from pipelines.recorder import Recorder
+from pipelines.run import RAY_SETTINGS
 from pipelines.store import StoreError, one_line
 from pipelines.trainable import RunTrainable
 
-KNOCK = 5.0  # seconds to wait for a cluster to answer
-DEATHS = 3  # workers that may die in a row on one run without getting it further
-
-
-def _knock(address: str | None) -> None:
-    """Raise `StoreError` if nobody listens at host:port: Ray itself would try for minutes."""
-    host, colon, port = (address or "").rpartition(":")
-    if not colon or not port.isdigit() or "://" in host:
-        return
-    try:
-        socket.create_connection((host.strip("[]"), int(port)), KNOCK).close()
-    except OSError as error:
-        raise StoreError(f"Ray cannot be used, the cluster at RAY_ADDRESS={address}: {one_line(error)}") from error
+QUIET: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.CRITICAL}
 
 
 @contextmanager
@@ -62,43 +52,65 @@ def sockets(name: str) -> Iterator[Path]:
 
 
 @contextmanager
-def ray_session(cpus: int, name: str = "") -> Iterator[None]:
+def ray_session(concurrent: int, cpus: int = 1, name: str = "", home: Path | None = None) -> Iterator[list[str]]:
     """The cluster at `$RAY_ADDRESS`, or one on this machine for as long as it is needed.
 
     Args:
-        cpus: of one on this machine.
+        concurrent: trainings at a time.
+        cpus: processors of each.
         name: see `sockets`; this process if empty.
+        home: the work folder, which all nodes of a cluster have to share; not looked at if None.
+
+    Yields:
+        What a person should know of a cluster, line by line.
 
     Raises:
-        StoreError: the cluster cannot be reached, or none can be started.
+        StoreError: the cluster cannot be reached or one of its nodes cannot train, or none can be started here.
     """
     if ray.is_initialized():
-        yield
+        yield []
         return
-    address = os.environ.get("RAY_ADDRESS")
-    _knock(address)
-    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.CRITICAL}
+    with _joined(address()) if address() else _started(concurrent * cpus, name):
+        yield [outline(concurrent, cpus), *(survey(home) if home else [])] if address() else []
+
+
+@contextmanager
+def _joined(where: str) -> Iterator[None]:
+    knock(where)
+    with _explained(f"the cluster at RAY_ADDRESS={where}"):
+        ray.init(address=where, runtime_env=travelling(RAY_SETTINGS), **QUIET)
+    try:
+        with watched(ray.get_runtime_context().gcs_address):
+            yield
+    finally:
+        ray.shutdown()
+
+
+@contextmanager
+def _started(cpus: int, name: str) -> Iterator[None]:
     with sockets(name or str(os.getpid())) as folder:
-        try:
-            if address:
-                ray.init(address=address, **quiet)
-            else:
-                os.environ.setdefault("RAY_AUTH_MODE", "disabled")
-                ray.init(
-                    address="local",
-                    num_cpus=cpus,
-                    include_dashboard=False,
-                    object_store_memory=100 * 2**20,
-                    _temp_dir=str(folder),
-                    **quiet,
-                )
-        except (ConnectionError, OSError, RuntimeError, ValueError) as error:
-            where = f"the cluster at RAY_ADDRESS={address}" if address else "on this machine"
-            raise StoreError(f"Ray cannot be used, {where}: {one_line(error)}") from error
+        with _explained("on this machine"):
+            os.environ.setdefault("RAY_AUTH_MODE", "disabled")
+            ray.init(
+                address="local",
+                num_cpus=cpus,
+                include_dashboard=False,
+                object_store_memory=100 * 2**20,
+                _temp_dir=str(folder),
+                **QUIET,
+            )
         try:
             yield
         finally:
             ray.shutdown()
+
+
+@contextmanager
+def _explained(where: str) -> Iterator[None]:
+    try:
+        yield
+    except (ConnectionError, OSError, RuntimeError, ValueError, RayError) as error:
+        raise StoreError(f"Ray cannot be used, {where}: {one_line(error)}") from error
 
 
 def fit(jobs: list[dict[str, Any]], recorder: Recorder, scratch: Path, concurrent: int, cpus: int, stop: Path) -> None:
@@ -166,6 +178,8 @@ class Bridge(tune.Callback):
         self.recorder, self.stop = recorder, stop
         self.error: StoreError | None = None
         self.live: set[str] = set()
+        self.places: dict[str, Place] = {}  # key -> where its worker is, once it has told
+        self.deaths: dict[str, Deaths] = defaultdict(Deaths)
         self.furthest: dict[str, float] = {}  # key -> last step of its points; a continued run tells old ones again
 
     def __getstate__(self) -> dict[str, Any]:
@@ -186,25 +200,46 @@ class Bridge(tune.Callback):
         last = max((point["step"] for point in result["points"]), default=-1.0)
         if last > self.furthest.get(key, -1.0):
             self.furthest[key] = last
+            self.deaths.pop(key, None)
             trial.max_failures = trial.num_failures + DEATHS - 1
         if result["done"]:
             self.live.discard(key)
         if key in self.recorder.logs:
+            self._placed(key, Place(*result["place"]))
             self._safely(self.recorder.result, key, result)
+
+    def _placed(self, key: str, place: Place) -> None:
+        """Tell once where a training goes on. On one machine there is nothing to tell."""
+        if self.places.get(key) != place and address():
+            self._safely(self.recorder.placed, key, str(place))
+        self.places[key] = place
 
     def on_trial_recover(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
         """Ray calls this when a worker died and another one will take its trial."""
-        self.live.discard(key_of(trial))
-        self._safely(self.recorder.died, key_of(trial))
+        key = key_of(trial)
+        self._died(key, trial)
+        trial.max_failures = trial.num_failures + self.deaths[key].left - 1
+        self._safely(self.recorder.died, key)
 
     def on_trial_error(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
         """Ray calls this when a worker died and none will take its trial."""
         key = key_of(trial)
+        trace = self._died(key, trial)
+        last = next((line.strip() for line in reversed(trace.splitlines()) if line.strip()), "no reason given")
+        if key not in self.recorder.logs and self.stop.exists():
+            return  # what had not begun when all was stopped just waits
+        if self.deaths[key].left > 0:
+            self._safely(self.recorder.lost, key)
+        else:
+            self._safely(self.recorder.failed, key, f"its worker died: {last[:300]}", trace)
+
+    def _died(self, key: str, trial: Trial) -> str:
+        """Count the death of a worker, and say what Ray wrote of all of them."""
         self.live.discard(key)
         trace = Path(trial.error_file).read_text() if trial.error_file else ""
-        last = next((line.strip() for line in reversed(trace.splitlines()) if line.strip()), "no reason given")
-        if key in self.recorder.logs or not self.stop.exists():  # what had not begun when all was stopped just waits
-            self._safely(self.recorder.failed, key, f"its worker died: {last[:300]}", trace)
+        place = self.places.pop(key, None)
+        self.deaths[key].add(place.node if place else "", trace.rpartition("Failure #")[2])
+        return trace
 
     def _safely(self, call: Any, *args: Any) -> None:
         if self.error:

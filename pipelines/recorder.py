@@ -11,7 +11,7 @@ from pipelines.policy import CONFIG, FILE
 from pipelines.progress import Board
 from pipelines.render import EPISODE, WHY_NOT
 from pipelines.store import Checkpoints, Home
-from pipelines.tracker import RunLog, Status, StudyCard, Tracker, points_of
+from pipelines.tracker import Recorded, RunLog, Status, StudyCard, Tracker, points_of
 from rhmc.trainer import grid_step
 
 EXTRAS = (EPISODE, WHY_NOT)  # what a training may leave beside its policy
@@ -36,7 +36,8 @@ class Recorder:
         self.arms: dict[str, str] = {}  # of the runs that were started, by key
         self.failures: dict[str, str] = {}  # name of the run -> one line
         self.waiting: dict[str, list[Item]] = defaultdict(list)
-        self.busy = False  # whether another process was training one of them
+        self.places: dict[str, list[str]] = defaultdict(list)  # key -> the nodes that trained it in this launch
+        self.busy = False  # whether one of them was out of reach, and may be trained by now
         recorded = tracker.recorded()
         done = finished(recorded)
         for item in plan:
@@ -45,7 +46,15 @@ class Recorder:
         self.skipped = len(plan) - self.left
         self.overview = Overview(study, plan, tracker, recorded)
         self.overview.describe()
+        self._set_aside(recorded)
         self._tidy()
+
+    def _set_aside(self, recorded: list[Recorded]) -> None:
+        """Keep what was logged under another plan, other steps say, from being averaged with the runs of this one."""
+        planned = {(item.card.arm, item.key) for item in self.plan}
+        for run in recorded:
+            if run.stale == ((run.arm, run.key) in planned):
+                self.tracker.mark(run.ref, stale=not run.stale)
 
     def _tidy(self) -> None:
         """Remove what a launch left that was killed between finishing a run and removing its checkpoints."""
@@ -138,9 +147,21 @@ class Recorder:
         self._copy(log.ref, items[1:])
         Checkpoints(folder).clear()
 
+    def placed(self, key: str, node: str) -> None:
+        """A training goes on at a node of a cluster."""
+        self.places[key].append(node)
+        self.logs[key].tag("nodes", ", ".join(self.places[key]))
+
     def died(self, key: str) -> None:
         """The process that did a training is gone; another one will continue it."""
         self.board.end(self.waiting[key][0].name, "its worker died; another one continues it")
+
+    def lost(self, key: str) -> None:
+        """As `died`, but none will continue it before all others have ended."""
+        if key in self.logs:
+            self._end(key, "interrupted")
+        self.busy = True
+        self.board.end(self.waiting[key][0].name, "its node died; it is continued later")
 
     def failed(self, key: str, error: str, trace: str) -> None:
         """A training failed: keep why, go on with the others."""

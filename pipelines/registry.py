@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 import torch
 from mlflow import MlflowClient
-from mlflow.entities import LoggedModel, LoggedModelOutput
+from mlflow.entities import LoggedModel, LoggedModelOutput, LoggedModelStatus
+from mlflow.entities.model_registry import ModelVersion
 from mlflow.exceptions import MlflowException
 from mlflow.models import Model, ModelSignature
 from mlflow.types import ColSpec, Schema, TensorSpec
 from mlflow.utils.mlflow_tags import MLFLOW_MODEL_VERSIONS
 
-from pipelines.policy import FILE, load, save, sizes
+from pipelines.policy import FILE, Saved, load, save, sizes
 from pipelines.study import RunSpec
 from pipelines.tracker import Card, StudyCard
 from rhmc.envs import make_env
@@ -49,30 +50,58 @@ def register(client: MlflowClient, run: str, experiment: str, study: StudyCard, 
         policy: its file.
     """
     name = model_name(study, card.arm)
-    if client.search_model_versions(f"name = '{name}' and run_id = '{run}'", max_results=1):
-        return
     tags = {"study": study.study, "profile": study.profile, "variant": card.arm, "seed": str(card.seed)}
     tags |= {"spec": card.spec_id, "fingerprint": card.fingerprint, "commit": card.commit}
-    model = _logged(client, run, experiment, name.replace(".", "_"), tags, policy)
-    try:
-        client.create_registered_model(name, tags={k: tags[k] for k in ("study", "profile", "variant")})
-    except MlflowException as error:
-        if error.error_code != "RESOURCE_ALREADY_EXISTS":
-            raise
-    made = client.create_model_version(name, model.artifact_location, run, tags, model_id=model.model_id)
+    made = _registered(client, run, name)
+    if made is None:
+        model = _logged(client, run, experiment, name.replace(".", "_"), tags, policy)
+        try:
+            client.create_registered_model(name, tags={k: tags[k] for k in ("study", "profile", "variant")})
+        except MlflowException as error:
+            if error.error_code != "RESOURCE_ALREADY_EXISTS":
+                raise
+        client.create_model_version(name, model.artifact_location, run, tags, model_id=model.model_id)
+        made = _registered(client, run, name)  # asked for: an answer may have been lost, and the request sent twice
+        assert made is not None
     client.set_registered_model_alias(name, f"seed-{card.seed}", made.version)
     versions = [{"name": name, "version": made.version}]
-    client.set_logged_model_tags(model.model_id, {MLFLOW_MODEL_VERSIONS: json.dumps(versions)})
+    outputs = client.get_run(run).outputs  # a version does not say which model it is of
+    assert outputs is not None
+    (output,) = outputs.model_outputs
+    client.set_logged_model_tags(output.model_id, {MLFLOW_MODEL_VERSIONS: json.dumps(versions)})
+
+
+def _registered(client: MlflowClient, run: str, name: str) -> ModelVersion | None:
+    """The run's version, if there is one; a second one, of a request that was sent twice, is removed."""
+    found = client.search_model_versions(f"name = '{name}' and run_id = '{run}'")
+    ordered = sorted(found, key=lambda one: int(one.version))
+    for double in ordered[1:]:
+        client.delete_model_version(name, double.version)
+    return ordered[0] if ordered else None
 
 
 def _logged(
     client: MlflowClient, run: str, experiment: str, name: str, tags: dict[str, str], policy: Path
 ) -> LoggedModel:
-    """Keep the model's files in the store, as an output of the run; the one that is there already, if so."""
-    outputs = client.get_run(run).outputs
-    if outputs and outputs.model_outputs:  # kept by a launch that was killed before it could register it
-        return client.get_logged_model(outputs.model_outputs[0].model_id)
+    """Keep the model's files in the store, as an output of the run; what a killed launch left whole is taken up."""
+    made = None
+    for there in client.search_logged_models([experiment], f"source_run_id = '{run}'"):
+        if made is None and there.status == LoggedModelStatus.READY:
+            made = there
+        else:
+            client.delete_logged_model(there.model_id)
     saved = load(policy)
+    if made is None:
+        made = _written(client, run, experiment, name, tags, saved)
+    outputs = client.get_run(run).outputs
+    if not outputs or not outputs.model_outputs:
+        client.log_outputs(run, [LoggedModelOutput(made.model_id, step=saved.spec.trainer.steps)])
+    return made
+
+
+def _written(
+    client: MlflowClient, run: str, experiment: str, name: str, tags: dict[str, str], saved: Saved
+) -> LoggedModel:
     spec = saved.spec
     made = client.create_logged_model(experiment, name, run, tags, model_type="policy")
     with TemporaryDirectory() as folder:
@@ -89,14 +118,12 @@ def _logged(
             metadata=tags,
         )
         client.log_model_artifacts(made.model_id, local)
-    client.finalize_logged_model(made.model_id, "READY")
-    client.log_outputs(run, [LoggedModelOutput(made.model_id, step=spec.trainer.steps)])
-    return made
+    return client.finalize_logged_model(made.model_id, "READY")
 
 
 def signature(spec: RunSpec) -> ModelSignature:
     """The arrays that a policy takes and gives; -1 is the batch."""
-    size, real = sizes(spec), np.dtype("float32")
+    size, real = sizes(spec.env), np.dtype("float32")
     given: list[ColSpec | TensorSpec] = [
         TensorSpec(array.dtype, (-1, *array.shape[1:]), name) for name, array in example(spec).items()
     ]

@@ -1,4 +1,4 @@
-"""One episode of a policy as a small animation, beside another policy's if wanted."""
+"""One episode of a policy as a small animation, beside policies without learning and a bound if wanted."""
 
 import os
 import re
@@ -12,17 +12,20 @@ import torch
 from torch import Generator, Tensor
 
 from pipelines import policy
+from pipelines.animation import Panel, Scene, gif
 from pipelines.document import choices
-from pipelines.drawing import Panel, Scene, animation
 from pipelines.errors import InputError
 from pipelines.store import Home, StoreError
-from rhmc.envs import ENVS, EnvConfig
+from rhmc.envs import ENVS, EnvConfig, coverage
 from rhmc.scripted import SCRIPTED
+from rhmc.scripted.coverage import windows
+from rhmc.scripted.joint import best_choice
 
 FRAMES, MILLISECONDS = 40, 110
 EPISODE, WHY_NOT = "episode.gif", "episode.txt"  # what a run keeps: an animation, or why there is none
 RUN = re.compile(r"[0-9a-f]{32}")  # how MLflow names a run
 
+FREE = "free_heading_bound"  # a bound that can be shown: sensors that take any heading at once
 Act = Callable[[Any], tuple[Tensor, Tensor | None]]  # state -> action (1, N[, A]) and assignment (1, N, M) if any
 
 
@@ -45,14 +48,38 @@ def scripted(env: EnvConfig, name: str, episode: int) -> Act:
     """
     table = SCRIPTED[env.kind]
     if name not in table:
-        raise InputError(f"--beside: '{name}' is not allowed; {choices(name, table)}")
+        known = [*table, FREE] if env.kind == "coverage" else [*table]
+        raise InputError(f"--beside: '{name}' is not allowed; {choices(name, known)}")
     own = Generator().manual_seed(episode)
     return lambda state: (table[name](env, state, own), None)
 
 
+def panel(env: EnvConfig, name: str, episode: int) -> list[Scene]:
+    """The scenes of a policy without learning, or of sensors that take any heading at once.
+
+    Raises:
+        InputError: the task has neither.
+    """
+    if name == FREE and env.kind == "coverage":
+        return play(env, scripted(env, "hold", episode), episode, freely)
+    return play(env, scripted(env, name, episode), episode)
+
+
+def freely(state: coverage.State) -> coverage.State:
+    """The same state with headings under which as many targets are seen as under any."""
+    bearing, distance = coverage.relation(state)
+    seen, turn = windows(bearing, distance <= coverage.RANGE)
+    window = best_choice(seen, torch.zeros_like(turn))
+    turned = state.heading + turn.gather(-1, window.unsqueeze(-1)).squeeze(-1)
+    return state._replace(heading=coverage.wrap(turned))
+
+
 @torch.no_grad()
-def play(env: EnvConfig, act: Act, episode: int) -> list[Scene]:
-    """The scenes of one episode, start included. Start and target motion depend on `episode` alone."""
+def play(env: EnvConfig, act: Act, episode: int, place: Callable[[Any], Any] | None = None) -> list[Scene]:
+    """The scenes of one episode, start included. Start and target motion depend on `episode` alone.
+
+    place: what is done to every state after the step into it.
+    """
     physics = ENVS[env.kind][1]
     world = Generator().manual_seed(episode)
     state = physics.initial(env, 1, world)
@@ -60,6 +87,7 @@ def play(env: EnvConfig, act: Act, episode: int) -> list[Scene]:
     for step in range(1, physics.spec(env).episode + 1):
         action, assignment = act(state)
         state = physics.transition(env, state, action, world)
+        state = place(state) if place else state
         out = physics.outcome(env, state, action, assignment)
         rewards.append(out.reward)
         infos.append(out.info)
@@ -89,25 +117,32 @@ def episode_gif(saved: policy.Saved, episode: int = 0, beside: str | None = None
     Args:
         saved: whose.
         episode: names the start and the target motion.
-        beside: also a policy without learning, in the same episode.
+        beside: also policies without learning, or `FREE`, in the same episode: names with commas between.
         frames: at most so many.
 
     Raises:
         InputError: no such policy, or a state that this code cannot load.
     """
     env = saved.spec.env
-    others = {beside: scripted(env, beside, episode)} if beside else {}
+    names = [name.strip() for name in beside.split(",")] if beside else []
+    others = [Panel(f"{name.replace('_', ' ')}, episode {episode}", panel(env, name, episode)) for name in names]
     try:
         actor = policy.Actor(saved)
     except ValueError as error:
         raise InputError(f"the policy cannot be used: {error}") from error
-    acts = {f"{saved.spec.algo.kind}, seed {saved.spec.seed}": trained(actor)} | others
-    panels = [Panel(f"{name}, episode {episode}", play(env, act, episode)) for name, act in acts.items()]
-    return animation(env, panels, frames, MILLISECONDS)
+    own = f"{saved.spec.algo.kind}, seed {saved.spec.seed}, episode {episode}"
+    return gif(env, [Panel(own, play(env, trained(actor), episode)), *others], frames, MILLISECONDS)
 
 
-def render(what: str, out: Path, home: Home, episode: int = 0, beside: str | None = None, frames: int = FRAMES) -> Path:
-    """Write the animation of a run, by its id in MLflow, or of a checkpoint, by its path.
+def render(
+    what: str | policy.Saved,
+    out: Path,
+    home: Home,
+    episode: int = 0,
+    beside: str | None = None,
+    frames: int = FRAMES,
+) -> Path:
+    """Write the animation of a policy, of a run, by its id in MLflow, or of a checkpoint, by its path.
 
     Raises:
         InputError: what is given cannot be used; nothing is written.
@@ -115,15 +150,18 @@ def render(what: str, out: Path, home: Home, episode: int = 0, beside: str | Non
     """
     if out.is_dir() or not out.parent.is_dir():
         raise InputError(f"--out: {out} is a folder" if out.is_dir() else f"--out: {out.parent} is no folder")
-    path = Path(what)
-    if path.exists() or not RUN.fullmatch(what):
-        saved = policy.load(path)
-    else:
-        with TemporaryDirectory() as folder:
-            saved = policy.load(_fetch(what, home, Path(folder)))
+    saved = what if isinstance(what, policy.Saved) else _saved(what, home)
     torch.set_num_threads(saved.spec.trainer.threads)  # the actions of larger layers depend on it
     write(out, episode_gif(saved, episode, beside, frames))
     return out
+
+
+def _saved(what: str, home: Home) -> policy.Saved:
+    path = Path(what)
+    if path.exists() or not RUN.fullmatch(what):
+        return policy.load(path)
+    with TemporaryDirectory() as folder:
+        return policy.load(_fetch(what, home, Path(folder)))
 
 
 def _fetch(ref: str, home: Home, folder: Path) -> Path:

@@ -7,7 +7,7 @@ import shutil
 import signal
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING, Self
 from rich.console import Console
 
 from pipelines.fingerprint import fingerprint
+from pipelines.host import host
 from pipelines.plan import Item, commit, finished, items, study_card
 from pipelines.progress import Board, board, print_table
 from pipelines.recorder import Recorder
-from pipelines.store import Home, StoreError
+from pipelines.store import Home, StoreError, without_password
 from pipelines.study import Study
 from pipelines.tracker import Status, Tracker
 
@@ -51,12 +52,24 @@ def run_study(study: Study, home: Path) -> int:
         0 all finished, 1 some run failed, 2 something is in the way, 130 interrupted, 143 terminated. A second launch
         is always safe.
     """
+    return guarded(home, study.name, study.profile, lambda place, interrupts: _launch(study, place, interrupts))
+
+
+def guarded(home: Path, name: str, profile: str, launch: Callable[[Home, "Interrupts"], int]) -> int:
+    """Hold a study or a search while it is launched; what is in the way becomes one line and an exit code.
+
+    Args:
+        home: the work folder.
+        name: of the study or search.
+        profile: its profile.
+        launch: the work; gives the exit code.
+    """
     place, interrupts = Home(home), Interrupts()
     try:
         with interrupts:
             place.prepare()
-            with place.lock(study.name, study.profile):
-                return _launch(study, place, interrupts)
+            with place.lock(name, profile):
+                return launch(place, interrupts)
     except StoreError as error:
         print(f"rhmc: {error}", file=sys.stderr)
         return BAD
@@ -123,7 +136,7 @@ def _launch(study: Study, home: Home, interrupts: Interrupts) -> int:
     tracker = MlflowTracker(card, home)
     status: Status = "interrupted"
     try:
-        plan = items(study, fingerprint(), commit())
+        plan = items(study, fingerprint(), commit(), host())
         with board(Console()) as display:
             recorder = Recorder(card, plan, tracker, home, display)
             if recorder.skipped:
@@ -169,10 +182,13 @@ def train(study: Study, recorder: Recorder, home: Home, interrupts: Interrupts) 
         }
         for item in recorder.todo()
     ]
-    cpus = study.resources.concurrent * study.resources.cpus
+    concurrent, cpus = study.resources.concurrent, study.resources.cpus
+    session = ray_session(concurrent, cpus, home.name(study.name, study.profile), home.root)
     try:
-        with ray_session(cpus, home.name(study.name, study.profile)), interrupts.go_to(stop, recorder.board):
-            fit(jobs, recorder, scratch, study.resources.concurrent, study.resources.cpus, stop)
+        with session as remarks, interrupts.go_to(stop, recorder.board):
+            for remark in remarks:
+                recorder.board.say(remark)
+            fit(jobs, recorder, scratch, concurrent, cpus, stop)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
 
@@ -203,7 +219,7 @@ def _summary(study: Study, recorder: Recorder, tracker: "MlflowTracker") -> None
     next_command += "   (continues)" if recorder.left else ""
     lines = [
         f"look:  {tracker.where()}",
-        f"       experiment {tracker.name!r} in {tracker.uri}",
+        f"       experiment {tracker.name!r} in {without_password(tracker.uri)}",
         f"next:  {next_command}",
     ]
     console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
@@ -266,7 +282,10 @@ def _status(study: Study, home: Home) -> tuple[dict[str, dict[str, int]], bool]:
     tracker = open_existing(study_card(study), home)
     recorded = tracker.recorded() if tracker else []
     plan = items(study, fingerprint(), "")
-    state = {(run.arm, run.key): run.status for run in recorded}
+    # Runs of a driver that was killed are logged as running; a log in this folder knows no other driver than one here.
+    own = tracker is not None and tracker.uri == f"sqlite:///{home.database}"
+    seen = {"running": "interrupted"} if own and not home.driven(study.name, study.profile) else {}
+    state = {(run.arm, run.key): seen.get(run.status, run.status) for run in recorded}
     planned = {(item.card.arm, item.key) for item in plan}
     stale = Counter(run.arm for run in recorded if (run.arm, run.key) not in planned)
     arms = {}

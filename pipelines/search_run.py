@@ -22,11 +22,11 @@ from pipelines.fingerprint import fingerprint
 from pipelines.found import file_name, slug, winner_yaml, write_text
 from pipelines.plan import commit
 from pipelines.progress import Board, board, print_table
-from pipelines.run import BAD, DONE, FAILED, TERMINATED, Interrupts, set_up_ray
+from pipelines.run import BAD, DONE, FAILED, Interrupts, guarded, set_up_ray
 from pipelines.search import Search
-from pipelines.store import Checkpoints, Home, StoreError
+from pipelines.store import Checkpoints, Home, StoreError, without_password
 from pipelines.tracker import Card, RunLog, Status, StudyCard, Tracker
-from pipelines.trials import OBJECTIVE, Asked, Ledger, explained, look, open_storage, storage_url
+from pipelines.trials import OBJECTIVE, Asked, BaseStorage, Ledger, explained, look, opened, storage_url
 from rhmc.types import Metrics
 
 if TYPE_CHECKING:
@@ -63,21 +63,13 @@ def run_search(search: Search, home: Path, out: Path | None = None) -> int:
     Returns:
         0 every trial is finished or pruned, 1 some failed, 2 something is in the way, 130 interrupted, 143 terminated.
     """
-    place, interrupts = Home(home), Interrupts()
-    try:
-        with interrupts:
-            place.prepare()
-            with place.lock(search.name, search.profile):
-                return _launch(search, place, out or found_folder(search, place), interrupts)
-    except StoreError as error:
-        print(f"rhmc: {error}", file=sys.stderr)
-        return BAD
-    except KeyboardInterrupt:
-        print("rhmc: interrupted; the same command continues", file=sys.stderr)
-        return interrupts.code
-    except SystemExit:  # Ray's answer to SIGTERM while it starts
-        print("rhmc: terminated; the same command continues", file=sys.stderr)
-        return TERMINATED
+
+    def launch(place: Home, interrupts: Interrupts) -> int:
+        with opened(place) as storage:
+            assert storage is not None
+            return _launch(search, place, storage, out or found_folder(search, place), interrupts)
+
+    return guarded(home, search.name, search.profile, launch)
 
 
 def found_folder(search: Search, home: Home) -> Path:
@@ -90,12 +82,10 @@ def plots_folder(search: Search, home: Home) -> Path:
     return home.root / "searches" / f"{search.name}-{search.profile}"
 
 
-def _launch(search: Search, home: Home, out: Path, interrupts: Interrupts) -> int:
+def _launch(search: Search, home: Home, storage: BaseStorage, out: Path, interrupts: Interrupts) -> int:
     from pipelines.mlflow_tracker import MlflowTracker  # 3 s: only when something is launched
 
     code, url = fingerprint(), storage_url(home)
-    storage = open_storage(home)
-    assert storage is not None
     tracker = MlflowTracker(search_card(search), home)
     status: Status = "interrupted"
     try:
@@ -128,8 +118,11 @@ def _train(search: Search, ledgers: Sequence[Ledger], book: "Book", home: Home, 
     scratch.mkdir(parents=True)
     stop, resources = scratch / "stop", search.resources
     name = home.name(search.name, search.profile)
+    session = ray_session(resources.concurrent, resources.cpus, name, home.root)
     try:
-        with ray_session(resources.concurrent * resources.cpus, name), interrupts.go_to(stop, book.board):
+        with session as remarks, interrupts.go_to(stop, book.board):
+            for remark in remarks:
+                book.board.say(remark)
             Drive(search, ledgers, Pool(resources.concurrent, resources.cpus), book, home, stop).run()
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
@@ -204,6 +197,9 @@ class Drive:
             self._end(key)
             self.book.fail(key, one.asked, result.error, result.trace)
             one.ledger.fail(one.asked, result.error)
+            return
+        if "died" in result:
+            self.book.died(one.asked)
             return
         why = self._points(key, one, result["points"])
         if why:
@@ -297,6 +293,10 @@ class Book:
         """A trial saved itself for the next launch."""
         self._end(key, asked, "interrupted", "interrupted", "stopped; the next launch continues it")
 
+    def died(self, asked: Asked) -> None:
+        """The process that trained a trial is gone; another one continues it."""
+        self.board.say(f"{self._name(asked)}: its worker died; another one continues it")
+
     def fail(self, key: str, asked: Asked, error: str, trace: str) -> None:
         """A trial raised: keep why, go on with the others."""
         self.logs[key].tag("error", error)
@@ -336,8 +336,8 @@ def search_card(search: Search) -> StudyCard:
         f"pruner {search.pruner.kind}.\n\n" + "\n".join(spaces) + "\n\nA run is a trial: its curve is the mean over "
         "its seeds, `objective` the mean of their final returns. Pruned trials have no `objective`."
     )
-    params = {f"algo.{name}": None for arm in search.arms.values() for name in arm.space}
-    return StudyCard(search.name, search.profile, note, ("method", *params))
+    params = {name: [f"algo.{setting}" for setting in arm.space] for name, arm in search.arms.items()}
+    return StudyCard(search.name, search.profile, note, params, list(search.arms))
 
 
 # Results
@@ -379,7 +379,7 @@ def _summary(
     lines = [_best_line(ledger) for ledger in ledgers]
     lines += [f"winner: {file}" for file in written.winners]
     lines += [f"plot:   {file}" for file in written.plots]
-    lines += [f"look:   {tracker.where()}", f"        experiment {tracker.name!r} in {tracker.uri}"]
+    lines += [f"look:   {tracker.where()}", f"        experiment {tracker.name!r} in {without_password(tracker.uri)}"]
     changes = [word for text in search.overrides for word in ("--set", text)]
     again = shlex.join([search.file, "--profile", search.profile, *changes])
     lines += [] if whole else [f"next:   rhmc search run {again}   (continues)"]
@@ -415,8 +415,7 @@ def show_search(search: Search, home: Path) -> int:
     """
     place, code = Home(home), fingerprint()
     try:
-        storage = open_storage(place, write=False)
-        with explained(storage_url(place)):
+        with opened(place, write=False) as storage, explained(storage_url(place)):
             if storage is None:
                 print(f"{search.name} ({search.profile}): nothing has been tried yet")
                 return FAILED

@@ -3,6 +3,7 @@
 import hashlib
 import os
 import shutil
+import urllib.parse
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -15,6 +16,7 @@ from filelock import BaseFileLock, FileLock, Timeout
 from pipelines.errors import InputError
 from rhmc.types import State
 
+GLANCE = 0.5  # seconds that another process may hold a study's lock only to see whether it is free
 KEEP = 2  # checkpoints kept: should the newest be damaged, the one before is used
 
 
@@ -75,12 +77,12 @@ class Home:
         Raises:
             StoreError: another process drives it.
         """
-        path = self.root / "locks" / f"{study}-{profile}.lock"
+        path = self._lock_file(study, profile)
         path.parent.mkdir(parents=True, exist_ok=True)
         owner = path.with_suffix(".pid")
         lock = FileLock(path)
         try:
-            lock.acquire(timeout=0)
+            lock.acquire(timeout=GLANCE)
         except Timeout as error:
             pid = owner.read_text().strip() if owner.exists() else "unknown"
             message = f"{study} ({profile}) is already being run by process {pid} ({path}); wait for it or stop it"
@@ -90,6 +92,18 @@ class Home:
             yield
         finally:
             lock.release()
+
+    def driven(self, study: str, profile: str) -> bool:
+        """Whether a process drives the study and profile in this folder."""
+        path = self._lock_file(study, profile)
+        if not path.exists():
+            return False
+        with suppress(Timeout), FileLock(path).acquire(timeout=0):
+            return False
+        return True
+
+    def _lock_file(self, study: str, profile: str) -> Path:
+        return self.root / "locks" / f"{study}-{profile}.lock"
 
 
 class Checkpoints:
@@ -228,6 +242,15 @@ KEPT: dict[frozenset[str], Callable[[], State]] = {  # what learning keeps, by i
     frozenset(("rows",)): lambda: {"rows": []},
     frozenset(("rows", "count")): lambda: {"rows": {}, "count": torch.zeros(0, dtype=torch.int64)},
 }
+
+
+def without_password(uri: str) -> str:
+    """An address as it may be shown."""
+    try:
+        password = urllib.parse.urlsplit(uri).password
+    except ValueError:  # brackets that hold no address
+        return uri
+    return uri.replace(f":{password}@", ":***@", 1) if password else uri
 
 
 def one_line(error: BaseException) -> str:

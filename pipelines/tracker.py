@@ -8,8 +8,10 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
+from types import MappingProxyType
 from typing import Literal, NamedTuple, Protocol
 
+from pipelines.host import Host
 from rhmc.types import Metrics
 
 Status = Literal["running", "finished", "failed", "interrupted"]
@@ -21,7 +23,8 @@ class StudyCard(NamedTuple):
     study: str
     profile: str
     note: str  # Markdown: question, arms, seeds, budget
-    params: tuple[str, ...] = ()  # names of what varies between its runs, and method and seed
+    params: Mapping[str, Sequence[str]] = MappingProxyType({})  # what varies, by method (arm of a search)
+    arms: Sequence[str] = ()
 
 
 class Card(NamedTuple):
@@ -36,6 +39,7 @@ class Card(NamedTuple):
     commit: str
     params: dict[str, str]  # what varies between the runs of the study, and method and seed
     trial: int | None = None  # of a search: then the run stands for all of its seeds
+    host: Host = Host()  # that starts it
 
     @property
     def key(self) -> str:
@@ -56,6 +60,8 @@ class Recorded(NamedTuple):
     key: str
     status: Status
     commit: str
+    stale: bool = False  # marked as no part of the latest plan
+    host: Host = Host()
 
 
 class Row(NamedTuple):
@@ -107,6 +113,10 @@ class Tracker(Protocol):
 
     def finished_anywhere(self, fingerprint: str) -> dict[str, str]:
         """Key -> ref of a finished run, of whatever study shares the log."""
+        ...
+
+    def mark(self, ref: str, *, stale: bool) -> None:
+        """Say of a run whether the latest plan is without it: then it stays, and views and averages pass over it."""
         ...
 
     def start(self, card: Card) -> RunLog:
@@ -208,7 +218,18 @@ class MemoryTracker:
 
     def recorded(self) -> list[Recorded]:
         """See `Tracker`."""
-        return [Recorded(r.ref, r.card.arm, r.card.key, r.status, r.card.commit) for r in self._mine()]
+        return [
+            Recorded(r.ref, r.card.arm, r.card.key, r.status, r.card.commit, "stale" in r.tags, r.card.host)
+            for r in self._mine()
+        ]
+
+    def mark(self, ref: str, *, stale: bool) -> None:
+        """See `Tracker`."""
+        (run,) = (run for run in self.shelf if run.ref == ref)
+        if stale:
+            run.tags["stale"] = "yes"
+        else:
+            run.tags.pop("stale", None)
 
     def finished_anywhere(self, fingerprint: str) -> dict[str, str]:
         """See `Tracker`."""

@@ -13,6 +13,7 @@ from typing import Any, NotRequired, TypedDict
 from filelock import Timeout
 from ray.tune import Trainable
 
+from pipelines.cluster import here
 from pipelines.policy import FILE, SPEC, Saved
 from pipelines.seeds import Seeds
 from pipelines.store import Checkpoints, StoreError, one_line, save_atomically, without_replay
@@ -38,10 +39,10 @@ class Job(TypedDict):
 class RunTrainable(Trainable):
     """See the module. Configuration: `{"job": Job}`.
 
-    A result has `done`, `stopped`, `seconds` and `points`: the new point of the grid, and at the first step of a
-    continued run every point before it as well, so that a log can be made whole. `busy` is true where another process
-    is training this run. What goes wrong is a result as well, with `error` (one line) and `trace`: were it raised, Ray
-    could not be told to replace a worker that died and to leave alone one that failed.
+    A result has `done`, `stopped`, `seconds`, `place` (a `cluster.Place`) and `points`: the new point of the grid, and
+    at the first step of a continued run every point before it as well, so that a log can be made whole. `busy` is true
+    where another process is training this run. What goes wrong is a result as well, with `error` (one line) and
+    `trace`: were it raised, Ray could not be told to replace a worker that died and to leave alone one that failed.
     """
 
     def setup(self, config: dict[str, Any]) -> None:
@@ -85,6 +86,9 @@ class RunTrainable(Trainable):
 
     def step(self) -> dict[str, Any]:
         """Train to the next point."""
+        return self._result() | {"place": here()}
+
+    def _result(self) -> dict[str, Any]:
         if self.trainer is None or self.ended:
             return self.ended
         try:

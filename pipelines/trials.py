@@ -288,7 +288,7 @@ class _Standing:
 
 
 def storage_url(home: Home) -> str:
-    """`$OPTUNA_STORAGE`, such as `postgresql+psycopg2://user@host/optuna`, or SQLite in the work folder."""
+    """`$OPTUNA_STORAGE`, such as `postgresql://user@host/optuna`, or SQLite in the work folder."""
     return os.environ.get("OPTUNA_STORAGE") or f"sqlite:///{home.searches}"
 
 
@@ -307,6 +307,18 @@ def open_storage(home: Home, *, write: bool = True) -> BaseStorage | None:
             return _open(url, write)
     except (OSError, ImportError, RuntimeError) as error:
         raise StoreError(f"{_shown(url)}: Optuna cannot use this database: {one_line(error)}") from error
+
+
+@contextmanager
+def opened(home: Home, *, write: bool = True) -> Iterator[BaseStorage | None]:
+    """`open_storage` for the length of a block."""
+    storage = open_storage(home, write=write)
+    try:
+        yield storage
+    finally:
+        if isinstance(storage, RDBStorage):
+            storage.remove_session()
+            storage.engine.dispose()
 
 
 def _open(url: str, write: bool) -> BaseStorage | None:

@@ -8,14 +8,14 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
+from reports import beyond, comparison, page, scaling, tables
 from reports import claims as rules
-from reports import comparison, page, scaling, tables
 from reports.canvas import save
 from reports.claims import VERDICTS, Claim
 from reports.frame import Results, TableError, load
-from reports.gallery import Picture, gallery, study_gallery
+from reports.gallery import Picture, gallery, in_short, study_gallery
 from reports.paper import Paper, read
 from reports.stats import FEW
 from reports.tables import Table, joined, steps
@@ -25,7 +25,7 @@ MADE = ("figures", "tables", "claims.md", "claims.csv", "claims.json", "index.md
 DEFINITIONS = (
     (
         "Final return",
-        "mean over seeds of final/return, the greedy policy after the last step on a bank of episodes that no curve "
+        "mean over seeds of final/return, the greedy policy after the last step on a bank of {episodes} that no curve "
         "uses. Coverage: 100 × mean reward per step; navigation: sum over an episode.",
     ),
     (
@@ -51,6 +51,10 @@ DEFINITIONS = (
 )
 
 
+Part = TypeVar("Part")
+FIRST = ("navigation", "coverage", "scaling", "ablation")  # studies of the paper, in its order
+MORE = ("profile_", "better_", "pairs_", "steadiness_", "yardsticks")
+LAST = ("provenance", "runs")  # tables with a part of their own at the end
 COMPLETE = "Nothing: every planned run is finished."
 DRAWN = "rhmc drawings"
 
@@ -65,6 +69,7 @@ class Report(NamedTuple):
     tables: dict[str, Table]
     claims: list[Claim]
     gaps: list[str]
+    short: list[str]  # what came out, a sentence a figure of the paper
 
 
 def build(runs: Path, out: Path, profile: str, study: str | None = None) -> list[Path]:
@@ -118,14 +123,23 @@ def _whole(results: Results, paper: Paper) -> Report:
     gaps += results.gaps(paper.arms | {scaling.STUDY: ()})
     title = f"Does it hold? The paper's results, profile {results.profile}"
     pictures, claims = gallery(results, paper), rules.judge(results, paper)
-    return Report(results, title, _lead(results), pictures, _tables(results, paper), claims, gaps)
+    made = _tables(results, paper)
+    return Report(results, title, _lead(results), pictures, made, claims, gaps, in_short(results, paper))
 
 
 def _single(results: Results, paper: Paper, study: str) -> Report:
-    made = _study_tables(results, study) | {"runs": tables.runs(_alone(results))}
+    own = _alone(results)
+    made = _study_tables(results, study) | {"provenance": tables.provenance(own), "runs": tables.runs(own)}
     title = f"Study {study}, profile {results.profile}"
     lead = f"{_question(results, study)} {_lead(results)}"
-    return Report(results, title, lead, study_gallery(results, paper, study), made, [], results.gaps({}))
+    return Report(results, title, lead, study_gallery(results, paper, study), made, [], results.gaps({}), [])
+
+
+def definitions(results: Results) -> list[tuple[str, str]]:
+    """What the words mean, with the size of the final bank."""
+    counts = sorted({n for study in results.studies if (n := results.final_episodes(study))})
+    episodes = f"{' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))} episodes" if counts else "episodes"
+    return [(name, words.replace("{episodes}", episodes)) for name, words in DEFINITIONS]
 
 
 def _write(report: Report, folder: Path) -> None:
@@ -157,9 +171,14 @@ def _tables(results: Results, paper: Paper) -> dict[str, Table]:
     for study in results.studies:
         made |= _study_tables(results, study)
     made |= {"yardsticks": tables.yardsticks(results)} if results.yardsticks else {}
-    shortfall = tables.theorem(results)
-    made |= {"theorem": shortfall} if shortfall else {}
-    return made | {"runs": tables.runs(results)}
+    every = {
+        "numbers": beyond.table_numbers(results),
+        "transfer": beyond.table_transfer(results),
+        "encoder": beyond.table_encoder(results),
+        "theorem": tables.theorem(results),
+    }
+    made |= {name: table for name, table in every.items() if table}
+    return made | {"provenance": tables.provenance(results), "runs": tables.runs(results)}
 
 
 def _study_tables(results: Results, study: str) -> dict[str, Table]:
@@ -170,6 +189,7 @@ def _study_tables(results: Results, study: str) -> dict[str, Table]:
         "final": tables.finals(results, study),
         "pairs": comparison.pairs_table(results, study),
         "efficiency": comparison.efficiency(results, study),
+        "assignments": beyond.table_assignments(results, study),
         "steadiness": steadiness if len(steadiness.shown) else None,
         "agents": scaling.table(results, found) if found else None,
     }
@@ -187,6 +207,8 @@ def _index(report: Report) -> Iterator[str]:
     yield f"# {report.title}\n"
     yield "The same with everything in one page: `index.html`.\n"
     yield f"{_summary(results)}\n"
+    if report.short:
+        yield "\n".join(f"- {line}" for line in report.short) + "\n"
     if report.gaps:
         yield "Not everything is there yet: see [what is missing](#what-is-missing).\n"
     yield "## Figures\n"
@@ -201,18 +223,19 @@ def _index(report: Report) -> Iterator[str]:
         yield f"{_count(listed)} A rule computes each verdict: [claims.md](claims.md) prints it beside the runs used.\n"
         yield f"{listed.markdown()}\n"
     for name, table in report.tables.items():
-        if name != "runs":
+        if name not in LAST:
             yield f"## {table.title}\n"
             if table.note:
                 yield f"{table.note}\n"
             yield f"{table.markdown()}\n"
             yield f"{_links('tables', name, 'CSV', 'LaTeX')}\n"
     yield "## Definitions\n"
-    yield "\n".join(f"- **{name}**: {words}" for name, words in DEFINITIONS) + "\n"
+    yield "\n".join(f"- **{name}**: {words}" for name, words in definitions(results)) + "\n"
     yield "## What is missing\n"
     yield "\n".join(f"- {gap}" for gap in report.gaps) + "\n" if report.gaps else f"{COMPLETE}\n"
     yield "## Runs behind the numbers\n"
     yield f"{_origin(results)}\n"
+    yield f"{report.tables['provenance'].markdown()}\n"
     yield report.tables["runs"].markdown()
 
 
@@ -228,14 +251,18 @@ def _content(report: Report, pictures: Path) -> Mapping[str, Any]:
     return {
         "title": report.title,
         "lead": report.lead,
+        "short": report.short,
+        "folded": page.FOLDED,
         "tally": page.verdicts(report.claims),
         "gaps": [gap.replace("`", "") for gap in report.gaps],
         "claims": [page.card(claim) for claim in report.claims],
         "sections": _sections(report, pictures),
-        "definitions": DEFINITIONS,
+        "definitions": definitions(results),
         "mixed": results.runs["fingerprint"].dropna().astype(str).replace("", None).nunique() > 1,
         "provenance": page.provenance(results),
+        "made": page.grid("provenance", report.tables["provenance"]),
         "runs": page.grid("runs", runs),
+        "counted": "runs" if set(results.runs["study"]) <= set(results.studies) else "runs, with scripted policies",
         "ids": [f"run-{run}" if first else "" for run, first in _first_seen(runs)],
         "foot": f"Built from the exported tables of profile {results.profile}; the same tables give the same page.",
     }
@@ -250,9 +277,11 @@ def _first_seen(runs: Table) -> Iterator[tuple[str, bool]]:
 
 
 def _sections(report: Report, pictures: Path) -> list[page.Section]:
-    """The method and its tasks first, then a part per study, then what belongs to none."""
-    studies = report.results.studies
-    of_table = {name: study for study in studies for name in report.tables if name.endswith(f"_{study}")}
+    """The method and its tasks first, then a part per study, those of the paper first, then what belongs to none."""
+    others = [name for name in report.results.studies if name not in FIRST]
+    studies = [name for name in FIRST if name in report.results.studies] + others
+    shortest = sorted(studies, key=len)  # of `letter` and `coverage_letter` the longer one has the last word
+    of_table = {name: study for study in shortest for name in report.tables if name.endswith(f"_{study}")}
     of_table |= {name: "ablation" for name in ("table_2",) if name in report.tables}
     whole = [_section(report, pictures, "method", "The method and its tasks", "", ("table_1",))]
     whole += [
@@ -260,17 +289,34 @@ def _sections(report: Report, pictures: Path) -> list[page.Section]:
         for study in studies
         for names in [tuple(name for name, owner in of_table.items() if owner == study)]
     ]
-    rest = tuple(name for name in report.tables if name not in of_table and name not in ("table_1", "runs"))
-    whole.append(_section(report, pictures, "scale", "Scripted policies, bounds, Theorem 1", "-", rest))
+    rest = tuple(name for name in report.tables if name not in of_table and name not in ("table_1", *LAST))
+    whole.append(
+        _section(report, pictures, "scale", "Scripted policies, bounds, transfer, encoder, Theorem 1", "-", rest)
+    )
     return [section for section in whole if section.plates or section.grids]
 
 
 def _section(report: Report, pictures: Path, name: str, title: str, study: str, names: Sequence[str]) -> page.Section:
     mine = [picture for picture in report.pictures if picture.study == study]
     made = rules.command(study, report.results.profile) if study in report.results.studies else DRAWN
-    plates = [page.plate(picture, pictures, made.partition(" && ")[0]) for picture in mine]
-    grids = [page.grid(key, report.tables[key]) for key in names if key in report.tables]
-    return page.Section(name, title, plates, grids)
+    plates = {p.name: page.plate(p, pictures, p.behind or made.partition(" && ")[0]) for p in mine}
+    if not study:
+        episodes = [page.episode(task, gif) for task, gif in report.results.episodes.items()]
+        plates |= {plate.name: plate for plate in episodes}
+    grids = {key: page.grid(key, report.tables[key]) for key in names if key in report.tables}
+    words = _question(report.results, study) if study in report.results.studies else ""
+    return page.Section(name, title, words, *_parted(plates), *_parted(grids))
+
+
+def _parted(found: Mapping[str, Part]) -> tuple[list[Part], list[Part]]:
+    """What is shown at once, and what is folded away."""
+    shown = [x for key, x in found.items() if not _folded(key)]
+    return shown, [x for key, x in found.items() if _folded(key)]
+
+
+def _folded(name: str) -> bool:
+    """Whether a figure or a table is folded away: what looks at the same runs in yet another way."""
+    return name.startswith(MORE) or name.endswith("_arms")
 
 
 def _heading(results: Results, study: str) -> str:

@@ -113,8 +113,13 @@ class Evidence:
         return [arm for arm in arms if len(self.results.finals(study, arm)) > 1]
 
     def rivals(self, study: str) -> tuple[list[str], list[str]]:
-        """Every other arm of the study with results, and those of the paper's that have none."""
-        others = self.present(study, (arm for arm in self.results.arms(study) if arm != "RHMC"))
+        """Every other method of the study with results, and those of the paper's that have none.
+
+        An arm that is RHMC with other settings is no other method.
+        """
+        own = self.results.kind(study, "RHMC")
+        arms = [arm for arm in self.results.arms(study) if arm != "RHMC" and self.results.kind(study, arm) != own]
+        others = self.present(study, arms)
         absent = [arm for arm in self.paper.arms[study] if arm != "RHMC" and arm not in others]
         if not others:
             raise UntestableError(f"Study {study} has no results of another method to compare with.")

@@ -145,10 +145,12 @@ def profile(results: Results, study: str) -> Drawing | None:
         figure = blank(9.0, 4.6)
         head(figure, f"Performance profile, study {study}", "share of seeds that end at or above a score")
         axes = figure.add_axes((0.075, 0.17, 0.6, 0.66))
-        for arm, share in shares.items():
+        for arm in shares:
             colour, dashes = look(arm, results.arms(study))
             words = f"{arm} ({len(values[arm])} seeds)"
-            axes.step(grid, share, where="pre", color=colour, linestyle=dashes, linewidth=1.8, label=words)
+            own = np.append(values[arm][:1], values[arm])  # drawn from its first seed to its last, lines apart
+            left = np.append(1.0, above(values[arm], np.nextafter(values[arm], np.inf)))
+            axes.step(own, left, where="post", color=colour, linestyle=dashes, linewidth=1.8, label=words)
         axes.set_xlabel("final return")
         axes.set_ylabel("share of seeds")
         axes.set_ylim(-0.02, 1.04)
@@ -175,7 +177,7 @@ def matrix(results: Results, study: str) -> Drawing | None:
     side = 0.52 * len(arms)
     left = 0.35 + 0.082 * max(map(len, arms))
     with styled():
-        figure = blank(max(left + side + 0.4, 6.4), side + 1.5 + 0.055 * max(map(len, arms)))
+        figure = blank(max(left + side + 0.4 + 0.05 * len(arms[-1]), 6.4), side + 1.5 + 0.055 * max(map(len, arms)))
         width, height = figure.get_size_inches()
         head(figure, f"Probability of improvement, study {study}", "that a seed of the row beats one of the column")
         axes = figure.add_axes((left / width, 0.45 / height, side / width, side / height))

@@ -14,7 +14,7 @@ from reports.drawn import Build, Layer, Network
 from reports.tables import describe_task, joined
 
 INPUT, OUTPUT = "#E8F1F8", "#FBEDE3"
-STEP, WIDTH = 3.3, 2.0  # from column to column, and of a box
+STEP, WIDTH = 3.9, 2.0  # from column to column, and of a box
 
 
 class Box(NamedTuple):
@@ -102,12 +102,12 @@ def level(builds: Sequence[Build], role: str, title: str) -> Drawing:
     flows = [flow(network) for _, network in parts]
     heights = [max(1.35, 0.72 * max(len(f.rows(c)) for c in range(f.columns))) + 0.45 for f in flows]
     with styled():
-        figure = blank(12.0, sum(heights) + 1.15)
+        figure = blank(13.5, sum(heights) + 1.35)
         head(figure, title, _subtitle(builds))
-        top = 1 - 0.75 / (sum(heights) + 1.15)
+        top = 1 - 0.75 / (sum(heights) + 1.35)
         wide = max(f.columns for f in flows)
         for (build, network), boxes, height in zip(parts, flows, heights, strict=True):
-            share = height / (sum(heights) + 1.15)
+            share = height / (sum(heights) + 1.35)
             axes = _canvas(figure, (0.02, top - share, 0.96, share), (0, wide * STEP), (0, height / 0.72))
             _draw_flow(axes, boxes, network, build.encoder)
             top -= share
@@ -159,7 +159,7 @@ def _columns(names: Sequence[str], edges: Sequence[tuple[str, str]]) -> dict[str
 
 def _words(layer: Layer, active: bool) -> tuple[str, str]:
     kind = "" if layer.kind == "Linear" else f"{layer.kind} "
-    return layer.name, f"{kind}{layer.width_in} → {layer.width_out}{', ReLU' if active else ''}"
+    return layer.name.removeprefix("body."), f"{kind}{layer.width_in} → {layer.width_out}{', ReLU' if active else ''}"
 
 
 def _shape(shape: Sequence[int]) -> str:

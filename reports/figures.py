@@ -30,6 +30,7 @@ LETTERS, LEGEND = 34, 108  # that fit on a line on the right, and in a row of th
 MANY = 6  # more arms than this get a frame each as well
 COLUMNS = 4  # of those frames
 LEFT, SHARE = 0.075, 0.64  # of the axes, of the figure's width
+RISE = 0.15  # share of the budget in which curves rise
 
 
 class Label(NamedTuple):
@@ -88,7 +89,10 @@ def each_arm(results: Results, spec: Curves) -> Drawing | None:
     height = HEAD + 1.75 * rows + 0.75
     with styled():
         figure = blank(WIDTH, height)
-        head(figure, f"{spec.title}, arm by arm", "coloured: the arm named above; grey: all others, on the same axes")
+        words = (
+            "coloured: the arm named above; grey: all others. The axis is cut below what arms hold after the first rise"
+        )
+        head(figure, f"{spec.title}, arm by arm", words)
         shared: Axes | None = None
         for n, arm in enumerate(curves):
             row, column = divmod(n, COLUMNS)
@@ -101,8 +105,20 @@ def each_arm(results: Results, spec: Curves) -> Drawing | None:
                     axes.plot(points["step"], points["mean"], color="#D5D5D5", linewidth=0.8, zorder=2)
             _draw_curve(axes, curves[arm], look(arm, list(curves))[0], "-")
             _name_frame(axes, arm, results.finals(spec.study, arm))
-        foot(figure, footer(results, spec))
+            axes.set_ylim(*_held(curves))
+        foot(figure, footer(results, spec, levels=False))
     return Drawing(figure, _numbers(curves, {}, {}))
+
+
+def _held(curves: Mapping[str, pd.DataFrame]) -> tuple[float, float]:
+    """Heights between which all means are once `RISE` of the budget is spent, with a margin."""
+    last = max(float(rows["step"].max()) for rows in curves.values())
+    late = [rows.loc[rows["step"] >= RISE * last, "mean"] for rows in curves.values()]
+    values = pd.concat(
+        [rows if len(rows) else curve["mean"] for rows, curve in zip(late, curves.values(), strict=True)]
+    )
+    margin = 0.12 * float(values.max() - values.min()) or 1.0
+    return float(values.min()) - margin, float(values.max()) + margin
 
 
 def spread(heights: Sequence[float], gap: float | Sequence[float], low: float, high: float) -> list[float]:
@@ -125,8 +141,11 @@ def spread(heights: Sequence[float], gap: float | Sequence[float], low: float, h
     return [float(y) for y in out]
 
 
-def footer(results: Results, spec: Curves) -> str:
-    """Profile, budget and seeds; what band and labels are; the code's fingerprint."""
+def footer(results: Results, spec: Curves, *, levels: bool = True) -> str:
+    """Profile, budget and seeds; what band and labels are; the code's fingerprint.
+
+    levels: whether the figure shows the paper's values and the scripted policies.
+    """
     plan = results.plan(spec.study)
     counts = sorted({len(results.plan(spec.study, arm)) for arm in results.arms(spec.study)})
     prints = ", ".join(sorted(set(plan["fingerprint"].dropna().astype(str)) - {""})) or "unknown"
@@ -137,8 +156,10 @@ def footer(results: Results, spec: Curves) -> str:
     first += f"{'–'.join(map(str, counts))} {'seed' if counts == [1] else 'seeds'}"
     lines = f"lines: mean over seeds of greedy evaluation; band: 95 % bootstrap interval of the mean{few}"
     names = ["names: final return"]
-    names += ["dotted: the paper's values"] if any(arm in spec.levels for arm in results.arms(spec.study)) else []
-    names += ["grey: scripted policies without learning, and bounds"] if _rulers(results, spec) else []
+    names += (
+        ["dotted: the paper's values"] if levels and any(arm in spec.levels for arm in results.arms(spec.study)) else []
+    )
+    names += ["grey: scripted policies without learning, and bounds"] if levels and _rulers(results, spec) else []
     return f"{first}  ·  code {prints}\n{lines}\n{'; '.join(names)}"
 
 
@@ -173,7 +194,8 @@ def _curve_labels(curves: Mapping[str, pd.DataFrame], results: Results, study: s
         finals = results.finals(study, arm)
         words = f"{arm} {number(float(finals.mean()))}" if len(finals) else f"{arm}, unfinished"
         text = "\n".join(wrap(words, LETTERS, break_on_hyphens=False))
-        labels.append(Label(float(rows["mean"].iloc[-1]), text, look(arm, results.arms(study))[0], True))
+        end = float(finals.mean()) if len(finals) else float(rows["mean"].iloc[-1])  # sorted as the words say
+        labels.append(Label(end, text, look(arm, results.arms(study))[0], True))
     return labels
 
 

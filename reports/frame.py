@@ -7,7 +7,7 @@ planned run). What is wrong in them is an error of one line per fault; what is n
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -39,10 +39,15 @@ TOLD = ("machine", "versions")  # of a run, where they are exported
 METHOD = ("kind", "name", "source", "family", "training", "execution", "critic", "coordination")
 STATUSES = ("finished", "partial", "missing")
 METHODS = "methods.json"  # what the methods are
+EPISODES = "episode_*.gif"  # animations, one a task
 YARDSTICKS, THEOREM = "yardsticks", "theorem"  # tables that are no studies
+MOVED = "transfer"  # the table of trained policies with other numbers of agents and targets
+PLAYED = ("study", "arm", "seed", "run", "task", "agents", "targets", "trained_agents", "trained_targets", "value")
+ASSIGNED = "assignments"  # `<study>.assignments.parquet`: what the runs of a study assigned while they trained
+ASSIGN = "assign/"  # prefix of its metrics
 FINAL, CURVE = "final/return", "eval/return"
 ERRORS = ("final/return_sem", "final/coverage_sem")  # of a scripted policy; one of both is there
-CHECKED = ("final/", "eval/", "theorem/")  # metrics that are shown: they must be finite
+CHECKED = ("final/", "eval/", "theorem/", ASSIGN)  # metrics that are shown: they must be finite
 SHOWN = 5  # faults of one kind that are spelled out
 
 # The order of arms everywhere; others follow by name.
@@ -77,6 +82,9 @@ class Results:
         methods: one record per method: `METHOD` as texts, `actions`, and `parameters` per task and encoder.
         modules: the networks of Figures 1 to 3, one build per encoder.
         scenes: what Figures 4, 5 and 8 show.
+        moved: trained policies with other numbers of agents and targets: columns `PLAYED`.
+        notes: what was left out of the tables, in sentences.
+        episodes: an animation of an episode by task, as a GIF.
     """
 
     points: pd.DataFrame
@@ -85,6 +93,9 @@ class Results:
     methods: Sequence[Mapping[str, Any]] = ()
     modules: Sequence[Build] = ()
     scenes: Scenes | None = None
+    moved: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=list(PLAYED)))
+    notes: tuple[str, ...] = ()
+    episodes: Mapping[str, bytes] = field(default_factory=dict)
 
     @property
     def studies(self) -> list[str]:
@@ -93,13 +104,15 @@ class Results:
 
     def arms(self, study: str) -> list[str]:
         """Planned arms of a study in the order of `ORDER`; none if the study is not there."""
-        found = set(self.runs.loc[self.runs["study"] == study, "arm"])
+        found = set(self.plan(study)["arm"])
         return sorted(found, key=lambda arm: (ORDER.index(arm) if arm in ORDER else len(ORDER), arm))
 
     def plan(self, study: str, arm: str | None = None) -> pd.DataFrame:
         """Planned runs of a study or of one of its arms, by arm and seed."""
-        rows = self.runs[(self.runs["study"] == study) & (True if arm is None else self.runs["arm"] == arm)]
-        return rows.sort_values(["arm", "seed"], kind="stable")
+        if (study, arm) not in self._plans:
+            rows = self.runs[(self.runs["study"] == study) & (True if arm is None else self.runs["arm"] == arm)]
+            self._plans[study, arm] = rows.sort_values(["arm", "seed"], kind="stable")
+        return self._plans[study, arm]
 
     def finished(self, study: str, arm: str) -> pd.DataFrame:
         """Planned runs of an arm that are finished."""
@@ -108,9 +121,11 @@ class Results:
 
     def finals(self, study: str, arm: str, metric: str = FINAL) -> NDArray[np.float64]:
         """Final values of an arm's finished runs, by seed: (n,), empty if there are none."""
-        rows = self._select(study, metric)
-        keep = (rows["arm"] == arm) & rows["seed"].isin(self.finished(study, arm)["seed"])
-        return rows[keep].sort_values("seed")["value"].to_numpy(np.float64)
+        if (study, arm, metric) not in self._finals:
+            rows = self._select(study, metric)
+            keep = (rows["arm"] == arm) & rows["seed"].isin(self.finished(study, arm)["seed"])
+            self._finals[study, arm, metric] = rows[keep].sort_values("seed")["value"].to_numpy(np.float64)
+        return self._finals[study, arm, metric].copy()
 
     def curve(self, study: str, arm: str, metric: str = CURVE) -> pd.DataFrame:
         """Points of an arm's runs, unfinished ones included: columns seed, step, value."""
@@ -199,7 +214,8 @@ class Results:
         Args:
             expected: arms that the paper has, per study.
         """
-        return [line for study in sorted({*expected, *self.studies}) for line in self._gaps(study, expected)]
+        found = [line for study in sorted({*expected, *self.studies}) for line in self._gaps(study, expected)]
+        return [*found, *self.notes]
 
     def _gaps(self, study: str, expected: Mapping[str, Sequence[str]]) -> Iterator[str]:
         arms = self.arms(study)
@@ -222,6 +238,14 @@ class Results:
     def _trainer(self, study: str, name: str) -> int | None:
         found = [_config(text).get("trainer", {}).get(name) for text in self.plan(study)["config"]]
         return max((int(x) for x in found if x is not None), default=None)
+
+    @cached_property
+    def _plans(self) -> dict[tuple[str, str | None], pd.DataFrame]:
+        return {}
+
+    @cached_property
+    def _finals(self) -> dict[tuple[str, str, str], NDArray[np.float64]]:
+        return {}
 
     @cached_property
     def _curves(self) -> dict[tuple[str, str, str], pd.DataFrame]:
@@ -252,13 +276,11 @@ def load(folder: Path, profile: str, only: str | None = None) -> Results:
     if only is not None:
         files = _only(files, only, folder)
     faults: list[str] = []
-    points: list[pd.DataFrame] = []
-    runs: list[pd.DataFrame] = []
+    tables: dict[str, list[pd.DataFrame]] = {name: [] for name in FORMS}
     for path in files:
-        plan = path.name.endswith(".runs.parquet")
-        table = _read(path, RUNS if plan else POINTS, faults)
-        (runs if plan else points).append(table)
-    names = {path.name.removesuffix(".parquet") for path in files}
+        part = _part(path)
+        tables[part].append(_read(path, FORMS[part], faults))
+    names = {path.name.removesuffix(".parquet") for path in files if _part(path) in ("points", "runs")}
     for name in sorted(names):
         if not name.endswith(".runs") and f"{name}.runs" not in names and name != THEOREM:
             faults.append(f"{name}.parquet: {name}.runs.parquet (the planned runs) is not beside it")
@@ -266,7 +288,14 @@ def load(folder: Path, profile: str, only: str | None = None) -> Results:
             faults.append(f"{name}.parquet: {name.removesuffix('.runs')}.parquet (the points) is not beside it")
     drawn = (_methods(folder / METHODS, faults), read_modules(folder, faults), read_scenes(folder, faults))
     if not faults:
-        results = Results(_join(points, POINTS), _join(runs, RUNS), profile, *(drawn if only is None else ()))
+        joined = {part: _join(found, FORMS[part]) for part, found in tables.items()}
+        watched, moved, notes = _of_plan(joined)
+        points = _join([joined["points"], watched], POINTS)
+        gifs = {path.stem.partition("_")[2]: path.read_bytes() for path in sorted(folder.glob(EPISODES))}
+        results = Results(points, joined["runs"], profile, moved=moved, notes=notes)
+        if only is None:
+            methods, modules, scenes = drawn
+            results = replace(results, methods=methods, modules=modules, scenes=scenes, episodes=gifs)
         faults = [*_plan_faults(results), *_point_faults(results)]
         if not faults:
             return results
@@ -285,9 +314,38 @@ def same_task(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
     return "kind" in shared and all(a[key] == b[key] for key in shared)
 
 
+FORMS: Mapping[str, tuple[str, ...]] = {"points": POINTS, "runs": RUNS, ASSIGNED: POINTS, MOVED: PLAYED}
+
+
+def _part(path: Path) -> str:
+    """Which of `FORMS` a file has."""
+    if path.name == f"{MOVED}.parquet":
+        return MOVED
+    second = path.name.removesuffix(".parquet").partition(".")[2]
+    return second if second in ("runs", ASSIGNED) else "points"
+
+
+def _of_plan(tables: Mapping[str, pd.DataFrame]) -> tuple[pd.DataFrame, pd.DataFrame, tuple[str, ...]]:
+    """What was watched and played later, without rows of runs that are no longer planned; and which studies had such.
+
+    These tables are made by commands of their own, so they can be older than the plan: not a fault, but not shown.
+    """
+    planned = set(zip(tables["runs"]["study"], tables["runs"]["arm"], tables["runs"]["run"], strict=True))
+    kept, notes = [], []
+    for part, verb in ((ASSIGNED, "assignments"), (MOVED, "transfer")):
+        table = tables[part]
+        keys = zip(table["study"], table["arm"], table["run"], strict=True)
+        there = np.array([key in planned for key in keys], dtype=bool)
+        kept.append(table[there])
+        for study in sorted(set(table["study"][~there])):
+            notes.append(f"Study `{study}`: `rhmc {verb}` was run on runs that are no longer planned; left out.")
+    return kept[0], kept[1], tuple(notes)
+
+
 def _only(files: Sequence[Path], study: str, folder: Path) -> list[Path]:
     """Those of a study and of the yardsticks."""
-    names = sorted({name for path in files if (name := path.name.split(".")[0]) not in (YARDSTICKS, THEOREM)})
+    other = (YARDSTICKS, THEOREM, MOVED)
+    names = sorted({name for path in files if (name := path.name.split(".")[0]) not in other})
     if study not in names:
         near = f"there are {', '.join(names)}" if names else "there is none"
         raise TableError(f"{folder}: no table of study {study!r} here ({near}); `rhmc export` writes it")
@@ -303,7 +361,7 @@ def _read(path: Path, columns: Sequence[str], faults: list[str]) -> pd.DataFrame
     absent = [column for column in columns if column not in table]
     if absent:
         faults.append(f"{path.name}: no column {', '.join(map(repr, absent))}; there are {', '.join(table.columns)}")
-    for column in ("seed", "step", "value", "seconds"):
+    for column in ("seed", "step", "value", "seconds", "agents", "targets"):
         if column in table and column in columns and len(table) and not pd.api.types.is_numeric_dtype(table[column]):
             faults.append(f"{path.name}: column {column!r} holds {table[column].dtype}, not numbers")
     told = [column for column in TOLD if columns == RUNS and column in table]
@@ -390,7 +448,8 @@ def _point_faults(results: Results) -> Iterator[str]:
         f"run {row.run}: two values of {row.metric} at step {row.step}, so two runs share one id"
         for row in differing.itertuples()
     )
-    with_points = set(zip(points["study"], points["run"], strict=True))
+    logged = points[~points["metric"].astype(str).str.startswith(ASSIGN)]
+    with_points = set(zip(logged["study"], logged["run"], strict=True))
     finals = points[points["metric"] == FINAL]
     with_final = set(zip(finals["study"], finals["run"], strict=True))
     for row in runs.itertuples():

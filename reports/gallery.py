@@ -3,13 +3,14 @@
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from reports import comparison, diagrams, figures, scaling, scenes
+from reports import beyond, comparison, diagrams, figures, scaling, scenes
 from reports.canvas import Drawing
 from reports.frame import FINAL, Results
 from reports.paper import Curves, Paper
-from reports.tables import describe_task, joined, number
+from reports.tables import describe_task, joined, number, steps
 
 PAPERS = "fig_"
+OWN = ("RHMC", "full")  # the paper's method
 
 
 class Picture(NamedTuple):
@@ -21,6 +22,7 @@ class Picture(NamedTuple):
     alt: str
     drawing: Drawing
     study: str = ""
+    behind: str = ""  # the command that made its numbers, where it is not the study's own
 
     @property
     def heading(self) -> str:
@@ -37,18 +39,50 @@ def gallery(results: Results, paper: Paper) -> list[Picture]:
         spec = paper.figures[known[study]] if study in known else paper.curves_of(study, results.task(study))
         drawn += _curves(results, spec, known.get(study, f"curves_{study}"))
     own = sorted((p for p in drawn if p.name.startswith(PAPERS)), key=lambda p: _order(p.name))
-    return own + [p for p in drawn if not p.name.startswith(PAPERS)] + list(beyond(results))
+    return own + [p for p in drawn if not p.name.startswith(PAPERS)] + list(comparisons(results))
+
+
+def in_short(results: Results, paper: Paper) -> list[str]:
+    """What came out, a sentence for each of the paper's comparisons that has runs."""
+    lines = []
+    for spec in paper.figures.values():
+        arms = comparison.compared(results, spec.study)
+        own = next((arm for arm in OWN if arm in arms), None)
+        if own is None or len(arms) < 2:
+            continue
+        first = arms[0] if arms[0] != own else arms[1]
+        side = "ahead of" if arms[0] == own else "behind"
+        values = [number(float(results.finals(spec.study, arm).mean())) for arm in (own, first)]
+        budget = results.budget(spec.study)
+        place = f"{arms.index(own) + 1} of {len(arms)} arms"
+        head = f"{spec.title.partition(':')[0]}, {steps(budget) if budget else 'unknown'} steps"
+        lines.append(f"{head}: {own} ends at {values[0]} ({place} by the mean), {side} {first} at {values[1]}.")
+    return lines
 
 
 def study_gallery(results: Results, paper: Paper, study: str) -> list[Picture]:
     """The figures of one study."""
     spec = paper.curves_of(study, results.task(study))
-    return [*_curves(results, spec, f"curves_{study}"), *_sweep(results, study, f"scaling_{study}"), *beyond(results)]
+    return [
+        *_curves(results, spec, f"curves_{study}"),
+        *_sweep(results, study, f"scaling_{study}"),
+        *comparisons(results),
+    ]
 
 
-def beyond(results: Results) -> Iterator[Picture]:
-    """What the paper does not have: performance profiles and probabilities of improvement."""
+def comparisons(results: Results) -> Iterator[Picture]:
+    """What the paper does not have: assignments, performance profiles, probabilities of improvement, transfer."""
     for study in results.studies:
+        watched = beyond.fig_assignments(results, study)
+        if watched:
+            title = f"What is assigned while training, study {study}"
+            caption = (
+                "The mechanism behind the ablation: see whether pairs grow fewer, whether two agents are sent to one "
+                "target ever less often, and whether targets are left to nobody."
+            )
+            alt = f"Three line charts against environment steps for {joined(beyond.assigning(results, study))}."
+            made = f"rhmc assignments studies/{study.partition('@')[0]}.yaml --profile {results.profile}"
+            yield Picture(f"assignments_{study}", title, caption, alt, watched, study, made)
         arms = comparison.compared(results, study)
         profile = comparison.profile(results, study)
         if profile:
@@ -61,6 +95,14 @@ def beyond(results: Results) -> Iterator[Picture]:
             caption = f"Rows are sorted by mean: the bluer the row, the more often it wins. On top: {arms[0]}."
             alt = f"Matrix of the probability that a seed of one arm beats one of another, for {joined(arms)}."
             yield Picture(f"better_{study}", title, caption, alt, matrix, study)
+    moved = beyond.fig_transfer(results)
+    if moved:
+        caption = (
+            "No step of training with the other numbers: see how far a policy follows the planner as sensors or "
+            "targets are added, and where it falls below sensors that each seek their own best window."
+        )
+        alt = "Two line charts of return against numbers of sensors and of targets."
+        yield Picture("transfer", "Trained once, played with other numbers", caption, alt, moved, "-", "rhmc transfer")
 
 
 def curve_caption(results: Results, study: str) -> str:
@@ -140,7 +182,10 @@ def _states(results: Results) -> Iterator[Picture]:
     alt = "Two plots of agents and landmarks in the plane, before and after an episode."
     yield Picture("fig_5", "Cooperative navigation", caption, alt, scenes.navigation(found.navigation))
     seen = ", ".join(f"{scenes.covered(s)} of {len(s.targets)} with {s.agents}" for s in found.coverage)
-    caption = "Five targets and more and more sensors: see how sectors overlap, so that a sensor more adds ever less."
+    caption = (
+        "Five targets and more and more sensors, each case an episode of its own: see how far apart they stand, how "
+        "little a sector of 90 degrees takes in, and how sectors begin to overlap."
+    )
     alt = f"Plots of sensors with their sectors of view and targets. Targets seen: {seen} sensors."
     yield Picture(
         "fig_8", "Sensor coverage with different numbers of sensors", caption, alt, scenes.coverage(found.coverage)

@@ -16,6 +16,14 @@ from reports.tables import NONE, Table
 
 TEMPLATE = "page.html.j2"
 NUMBER = re.compile(r"^[+<\s]*(-?\d[\d,]*(?:\.\d+)?)\s*([kM]?)\b")
+SHOWN = 2 / 3  # of a figure's pixels: all words on the page are then of one size
+FOLDED = 6  # quantities of a claim that are shown at once
+EPISODE_WORDS: Mapping[str, str] = {
+    "coverage": "Left a trained policy, its lines what its coordinator assigns; then each sensor seeking its own best "
+    "window; right any headings at will, the bound. Green: a target in sight; red ring: unseen.",
+    "navigation": "Left a trained policy; then each agent steering for its nearest landmark; right for the one that a "
+    "matching gives it. Green: a landmark with an agent on it.",
+}
 UNITS = {"": 1.0, "k": 1e3, "M": 1e6}
 MARKS: Mapping[str, str] = {  # a sign for each verdict, beside its colour
     "reproduced": "✓",
@@ -45,25 +53,38 @@ class Grid(NamedTuple):
 
 
 class Plate(NamedTuple):
-    """A figure as the page shows it."""
+    """A figure or an animation as the page shows it. `files`: words and the files that they lead to."""
 
     name: str
     heading: str
     caption: str
     alt: str
+    kind: str
     data: str
     width: int
     height: int
+    shown: int  # pixels of the page that it takes, if there is room
     behind: str
+    files: list[tuple[str, str]]
 
 
 class Section(NamedTuple):
-    """A part of the page."""
+    """A part of the page; what is `more` is folded away."""
 
     id: str
     title: str
+    words: str
     plates: list[Plate]
+    more_plates: list[Plate]
     grids: list[Grid]
+    more_grids: list[Grid]
+
+    @property
+    def more(self) -> str:
+        """What is folded away, in words."""
+        figures = [plate.heading.partition(", study ")[0] for plate in self.more_plates]
+        sheets = [grid.title.partition(" study ")[0].removesuffix(",").removesuffix(" in") for grid in self.more_grids]
+        return ", ".join(word[:1].lower() + word[1:] for word in figures + sheets)
 
 
 def render(content: Mapping[str, Any]) -> str:
@@ -77,8 +98,17 @@ def plate(picture: Picture, folder: Path, behind: str) -> Plate:
     """A figure from its PNG in a folder. behind: the command that made its numbers."""
     data = (folder / f"{picture.name}.png").read_bytes()
     width, height = int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")  # of the PNG's header
-    text = b64encode(data).decode()
-    return Plate(picture.name, picture.heading, picture.caption, picture.alt, text, width, height, behind)
+    files = [("PDF", f"figures/{picture.name}.pdf"), ("numbers", f"figures/{picture.name}.csv")]
+    about = (picture.name, picture.heading, picture.caption, picture.alt, "png", b64encode(data).decode())
+    return Plate(*about, width, height, round(width * SHOWN), behind, files)
+
+
+def episode(task: str, gif: bytes) -> Plate:
+    """An animation from what `rhmc render` wrote."""
+    width, height = int.from_bytes(gif[6:8], "little"), int.from_bytes(gif[8:10], "little")  # of the GIF's header
+    words = EPISODE_WORDS.get(task, "A trained policy, and others in the same episode.")
+    about = (f"episode_{task}", f"An episode of {task}", words, words, "gif", b64encode(gif).decode())
+    return Plate(*about, width, height, width, "rhmc render", [])
 
 
 def grid(name: str, table: Table, *, files: bool = True) -> Grid:
@@ -125,11 +155,9 @@ def card(claim: Claim) -> dict[str, Any]:
 def provenance(results: Results) -> list[tuple[str, str]]:
     """What made the runs: names and values."""
     runs = results.runs
-    known = {name: sorted(set(runs[name].dropna().astype(str)) - {""}) for name in ("fingerprint", "commit")}
+    known = sorted(set(runs["fingerprint"].dropna().astype(str)) - {""})
     seconds = float(runs["seconds"].fillna(0).sum())
-    found = [("Profile", results.profile)]
-    found += [("Code fingerprint", ", ".join(known["fingerprint"]) or "unknown")]
-    found += [("Commit", ", ".join(known["commit"]) or "unknown")]
+    found = [("Profile", results.profile), ("Code fingerprint", ", ".join(known) or "unknown")]
     for name in TOLD:
         values = sorted(set(runs[name].dropna().astype(str)) - {""}) if name in runs else []
         found.append((name.capitalize(), "; ".join(values) or "not exported"))

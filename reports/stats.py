@@ -172,11 +172,20 @@ def curve(points: pd.DataFrame) -> pd.DataFrame:
         where n = 1.
     """
     table = points.pivot_table(index="seed", columns="step", values="value")
-    rows = []
-    for step in table.columns:
-        value, low, high, n = interval(table[step].dropna().to_numpy())
-        rows.append((step, value, low, high, n))
-    return pd.DataFrame(rows, columns=["step", "mean", "low", "high", "n"])
+    counts = table.notna().sum()
+    parts = [_means(table[table.columns[counts == n]], int(n)) for n in sorted(set(counts))]
+    columns = ["step", "mean", "low", "high", "n"]
+    rows = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=columns)
+    return rows.sort_values("step", ignore_index=True)[columns]
+
+
+def _means(table: pd.DataFrame, n: int) -> pd.DataFrame:
+    """`interval` of each column of a table (seeds x steps) with n seeds each, all columns at once."""
+    x = np.array([table[step].dropna().to_numpy(np.float64) for step in table.columns]).T  # (n, k)
+    found = pd.DataFrame({"step": table.columns, "mean": x.mean(0), "low": np.nan, "high": np.nan, "n": n})
+    if n > 1:
+        found["low"], found["high"] = np.quantile(x.T @ _shares(n), [tail(n), 1 - tail(n)], axis=1)
+    return found
 
 
 def _score_bound(value: float, n: int, m: int, end: float) -> float:
@@ -201,6 +210,12 @@ def _resample(x: Values, stream: int = 0) -> Values:
 def _picks(n: int, stream: int) -> NDArray[np.int64]:
     """Which values each resample takes: (RESAMPLES, n). Samples of different streams are drawn independently."""
     return np.random.default_rng((SEED, stream)).integers(0, n, (RESAMPLES, n))
+
+
+@cache
+def _shares(n: int) -> Values:
+    """Share of each value in the mean of each resample: (n, RESAMPLES)."""
+    return np.stack([(_picks(n, 0) == k).mean(1) for k in range(n)])
 
 
 def _interval(value: float, draw: Callable[[], Values], n: int) -> Interval:

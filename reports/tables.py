@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from reports.frame import FINAL, METHOD, Results
+from reports.frame import FINAL, METHOD, TOLD, Results
 from reports.paper import Paper
 from reports.stats import LEVEL, Interval, change, improvement, interval, iqm
 
@@ -190,6 +190,40 @@ def theorem(results: Results) -> Table | None:
     )
     note = "Random instances: each option completes, and each pair is assigned, with the probability in the name."
     return Table("Theorem 1: Algorithm 1 against the optimum", numbers, shown, note)
+
+
+def provenance(results: Results) -> Table:
+    """What made the runs of every study: code, commit, machine, libraries, time."""
+    numbers, shown = [], []
+    for study, rows in results.runs.groupby("study"):
+        known = {
+            name: sorted(set(rows[name].dropna().astype(str)) - {""}) if name in rows else []
+            for name in ("fingerprint", "commit", *TOLD)
+        }
+        done, seconds = int((rows["status"] == "finished").sum()), float(rows["seconds"].fillna(0).sum())
+        numbers.append(
+            {"study": study, "finished": done, "planned": len(rows), "seconds": seconds}
+            | {name: "; ".join(values) for name, values in known.items()}
+        )
+        shown.append(
+            {
+                "Study": str(study),
+                "Finished": f"{done} of {len(rows)}",
+                "Code": "<br>".join(known["fingerprint"]) or NONE,
+                "Commit": "<br>".join(_short(commit) for commit in known["commit"]) or NONE,
+                "Machine": "<br>".join(known["machine"]) or NONE,
+                "Versions": "<br>".join(known["versions"]) or NONE,
+                "Processor time": f"{number(seconds / 60)} min" if seconds else NONE,
+            }
+        )
+    note = "Code: fingerprint of what decides results. A commit with + had changes that were not committed."
+    return Table("What made the runs", pd.DataFrame(numbers), pd.DataFrame(shown), note)
+
+
+def _short(commit: str) -> str:
+    """Twelve digits of a commit, with a + where files differed from it."""
+    name, _, dirty = commit.partition("-")
+    return f"{name[:12]}{'+' if dirty else ''}"
 
 
 def runs(results: Results) -> Table:

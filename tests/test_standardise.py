@@ -37,8 +37,8 @@ def seen(standard: Standard, batches: list[list[float]], *, returns: bool = Fals
 def test_rewards_get_mean_0_and_deviation_1_of_what_was_seen(batches: list[list[float]], reward: float) -> None:
     mean, deviation = moments(batches)
     paid = seen(Standard("reward", CPU), batches).reward(torch.tensor(reward, dtype=torch.float32))
-    # A deviation far below the values is the small difference of large squares: it is known to the float's digits only.
-    slack = 1e-3 + 1e-4 * max(abs(x) for batch in batches for x in batch) / deviation
+    # A variance far below the values' squares is the small difference of large numbers: to the float's digits only.
+    slack = 1e-3 + 5e-7 * (max(abs(x) for batch in batches for x in batch) / deviation) ** 2
     assert float(paid) * deviation == pytest.approx(reward - mean, rel=slack, abs=slack)
 
 

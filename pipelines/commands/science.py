@@ -75,7 +75,10 @@ def report(
     study: Annotated[Path | None, typer.Option(metavar="FILE", help="Report on this study alone.")] = None,
     variant: Annotated[str | None, typer.Option(help="Of that study.")] = None,
     runs: Annotated[Path | None, typer.Option(help="Exported tables; reports/<profile>/runs if not given.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder; reports/<profile>[/study/<name>] if not given.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder; reports/<profile>, with study/<name> after it for one study, if not given."),
+    ] = None,
 ) -> None:
     """Build figures, tables, claims and their page from the exported tables; or curves and comparison of one study."""
     if study is not None and not study.is_file():

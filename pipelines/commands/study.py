@@ -1,11 +1,13 @@
 """`rhmc study`: check, run, follow and move studies; `rhmc export` for the report."""
 
+import shlex
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from pipelines.commands.common import File, Json, Profile, Sets, Variant, load_study, say, say_json, table
+from pipelines.commands.common import BAD, File, Json, Profile, Sets, Variant, load_study, say, say_json, table
 from pipelines.errors import InputError
 
 app = typer.Typer(help="Check, run, follow and move studies.", no_args_is_help=True)
@@ -131,4 +133,9 @@ def export(
     study = load_study(file, profile, overrides, variant)
     from pipelines.export import export_study
 
-    raise typer.Exit(export_study(study, out or Path("reports") / profile / "runs"))
+    code = export_study(study, out or Path("reports") / profile / "runs")
+    if code != BAD:
+        words = ["rhmc", "report", "--study", str(file), *(["--profile", profile] if profile != "quick" else [])]
+        words += [*(["--variant", variant] if variant else []), *(["--runs", str(out)] if out else [])]
+        print(f"next:  {shlex.join(words)}", file=sys.stderr)
+    raise typer.Exit(code)

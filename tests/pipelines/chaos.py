@@ -22,6 +22,7 @@ from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import psutil
 import ray.tune.trainable.trainable
 import torch
 from mlflow.entities import ViewType
@@ -31,6 +32,7 @@ from werkzeug.serving import WSGIRequestHandler, make_server
 
 from pipelines import ray_driver, run
 from pipelines.mlflow_tracker import open_existing
+from pipelines.names import full
 from pipelines.plan import study_card
 from pipelines.recorder import Recorder
 from pipelines.store import Home
@@ -43,6 +45,7 @@ PRELOAD = ["mlflow.server", "mlflow.store.tracking.sqlalchemy_store"]
 FORKS = multiprocessing.get_context("forkserver")
 WRITES = ("INSERT", "UPDATE", "DELETE")
 KILLED = -signal.SIGKILL
+WORKER = "Trainable"  # in what Ray calls a process that trains, idle or at work
 FOREVER = 0  # a fuse that never burns down
 DAMAGES = ("cut short", "empty", "zeros inside", "noise inside", "noise")
 
@@ -58,6 +61,7 @@ class Run(NamedTuple):
     params: dict[str, str]
     history: dict[str, list[tuple[int, str]]]  # metric -> (step, value), doubled ones twice
     files: dict[str, str]  # name -> digest
+    models: list[str]  # its versions in the registry, by name and what they are called there
 
 
 def everything(study: Study, home: Path) -> list[Run]:
@@ -74,14 +78,15 @@ def _run(client: Any, one: Any, home: Path) -> Run:
     history = {}
     for metric in sorted(one.data.metrics):
         values = [
-            (m.step, "" if metric.startswith("time/") else m.value.hex())
+            (m.step, "" if full(metric).startswith("time/") else m.value.hex())
             for m in client.get_metric_history(ref, metric)
         ]
         history[metric] = sorted(values)
     kept = {file.path: client.download_artifacts(ref, file.path) for file in client.list_artifacts(ref)}
-    return Run(
-        name, one.info.status, one.data.params, history, {name: _digest(Path(path)) for name, path in kept.items()}
-    )
+    files = {name: _digest(Path(path)) for name, path in kept.items()}
+    versions = client.search_model_versions(f"run_id = '{ref}'")
+    models = [f"{v.name} {client.get_model_version(v.name, v.version).aliases}" for v in versions]
+    return Run(name, one.info.status, one.data.params, history, files, models)
 
 
 def _digest(path: Path) -> str:
@@ -110,12 +115,26 @@ def faults(found: list[Run], expected: list[Run]) -> dict[str, int]:
         "values doubled": sum(len(h) - len({step for step, _ in h}) for one in found for h in one.history.values()),
         "histories that differ": sum(one.history != other.history for one, other in both),
         "policies that differ": sum(one.files.get("policy.pt") != other.files.get("policy.pt") for one, other in both),
+        "models that differ": sum(one.models != other.models for one, other in both),
         "other files or params that differ": sum(
             (one.params, one.files.keys(), one.files.get("config.yaml"))
             != (other.params, other.files.keys(), other.files.get("config.yaml"))
             for one, other in both
         ),
     }
+
+
+# Processes to be killed
+
+
+def started_by(driver: int, name: str = "") -> list[psutil.Process]:
+    """What runs in the session of a driver, which may be gone, and has `name` in its command line."""
+    found = []
+    for process in psutil.process_iter():
+        with suppress(psutil.Error, OSError):
+            if os.getsid(process.pid) == driver and process.status() != psutil.STATUS_ZOMBIE:
+                found += [process] if name in " ".join(process.cmdline()) else []
+    return found
 
 
 # Processes that kill themselves
@@ -190,7 +209,7 @@ def _drive(study: str, home: str, uri: str | None, length: int, room: int | None
         os.environ["MLFLOW_TRACKING_URI"] = uri
     os.environ["MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR"] = "0"  # at most a second between two tries
     run.fingerprint = lambda: CODE
-    ray_driver.ray_session = lambda *args: nullcontext()
+    ray_driver.ray_session = lambda *args: nullcontext([])
     ray_driver.fit = fit_here
     fuse = Fuse(length)
     fuse.lay(home)
@@ -307,10 +326,10 @@ def damage(home: Path, rng: random.Random) -> str:
 
 def damaged(content: bytes, kind: str, rng: random.Random) -> bytes:
     """The content after a damage of `DAMAGES`."""
+    if kind == "empty" or not content:  # emptied before, and nobody has looked since
+        return b""
     if kind == "cut short":
         return content[: rng.randrange(len(content))]
-    if kind == "empty":
-        return b""
     if kind == "noise":
         return rng.randbytes(len(content))
     size = min(512, len(content))

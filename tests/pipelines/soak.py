@@ -29,7 +29,7 @@ from pipelines.mlflow_tracker import create_database, open_existing
 from pipelines.plan import items, study_card
 from pipelines.store import Home
 from pipelines.study import Study
-from tests.pipelines.chaos import Run, damage, everything, faults, free_port
+from tests.pipelines.chaos import WORKER, Run, damage, everything, faults, free_port, started_by
 from tests.pipelines.support import CODE, setting, tiny
 
 KINDS = ("driver", "worker", "server", "driver, politely", "node")
@@ -89,13 +89,13 @@ class Campaign:
             self.tally["processes left"] = len(self._left())
         finally:
             for pid in self.drivers:
-                for process in self._session(pid):
+                for process in started_by(pid):
                     process.kill()
 
     def _left(self) -> list[psutil.Process]:
         """What the drivers started and is still there after a minute."""
         for _ in range(120):
-            left = [process for pid in self.drivers for process in self._session(pid)]
+            left = [process for pid in self.drivers for process in started_by(pid)]
             if not left:
                 break
             time.sleep(0.5)
@@ -161,22 +161,13 @@ class Campaign:
             driver.send_signal(signal.SIGTERM if "politely" in kind else signal.SIGKILL)
             driver.wait()
         else:
-            victims = self._session(driver.pid, "ray::RunTrainable" if kind == "worker" else "raylet/raylet")
+            victims = started_by(driver.pid, WORKER if kind == "worker" else "raylet/raylet")
             if not victims:
                 return False
             with suppress(psutil.Error):
                 self.rng.choice(victims).kill()
         self.tally[f"killed: {kind}"] += 1
         return True
-
-    @staticmethod
-    def _session(driver: int, name: str = "") -> list[psutil.Process]:
-        found = []
-        for process in psutil.process_iter():
-            with suppress(psutil.Error, OSError):
-                if os.getsid(process.pid) == driver and process.status() != psutil.STATUS_ZOMBIE:
-                    found += [process] if name in " ".join(process.cmdline()) else []
-        return found
 
 
 def result(home: Path, uri: str, points: int) -> tuple[list[Run], bytes]:

@@ -12,6 +12,7 @@ from pipelines.bundle import Packed, pack, unpack
 from pipelines.export import export_study
 from pipelines.mlflow_tracker import MlflowTracker, open_existing
 from pipelines.plan import items, study_card
+from pipelines.policy import Saved, load, save
 from pipelines.store import Checkpoints, Home, StoreError, save_atomically
 from pipelines.study import Study
 from tests.pipelines.support import CODE, setting, tiny
@@ -38,7 +39,7 @@ def here(home: Path) -> Path:
         run = tracker.start(item.card)
         run.log([*POINTS, LAST])
         policy = home / "policy.pt"
-        policy.write_bytes(item.key.encode())
+        save(policy, Saved(item.spec, {"key": item.key}))
         run.artifact(policy)
         run.finish("finished")
     tracker.start(late.card).log(POINTS)
@@ -85,7 +86,8 @@ def test_there_is_what_was_here(here: Path, there: Path, tmp_path: Path, name: s
     }
     policy = tracker.file(runs["slow"].ref, "policy.pt", tmp_path)
     assert policy is not None
-    assert policy.read_bytes() == slow.key.encode()
+    assert load(policy) == Saved(slow.spec, {"key": slow.key})
+    assert {made.tags["variant"] for made in tracker.client.search_model_versions()} == {"slow", "fast"}
     assert [row.value for row in tracker.rows([runs["slow"].ref]) if row.metric == "time/seconds"] == [0.0, 2.0, 4.0]
     assert Checkpoints(Home(there).checkpoints(late.key)).newest() == {"a": 1}
 
@@ -174,9 +176,9 @@ def test_what_is_no_bundle_at_all(there: Path, tmp_path: Path) -> None:
 
 def test_a_later_format_is_named(here: Path, there: Path, tmp_path: Path) -> None:
     pack(STUDY, tmp_path / "b", here)
-    manifest = json.loads((tmp_path / "b/bundle.json").read_text()) | {"format": 2}
+    manifest = json.loads((tmp_path / "b/bundle.json").read_text()) | {"format": 3}
     (tmp_path / "b/bundle.json").write_text(json.dumps(manifest))
-    with pytest.raises(StoreError, match="b: a bundle of format 2; this version reads 1"):
+    with pytest.raises(StoreError, match="b: a bundle of format 3; this version reads 2"):
         unpack(tmp_path / "b", there)
 
 

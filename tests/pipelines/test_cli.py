@@ -1,5 +1,6 @@
 """The command: what it prints, what it refuses, and what it does not import."""
 
+import io
 import json
 import os
 import signal
@@ -10,7 +11,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import pandas as pd
 import pytest
@@ -97,9 +98,9 @@ def test_every_verb_explains_itself(rhmc: Rhmc, words: list[str]) -> None:
 
 def test_help_ends_with_the_exit_codes(rhmc: Rhmc) -> None:
     said = " ".join(rhmc("--help").out.split())
-    assert said.endswith("130 interrupted. Results are kept in $RHMC_HOME, or in the folder work.")
+    assert said.endswith("130 interrupted; 143 terminated. Results are kept in $RHMC_HOME, or in the folder work.")
     page = (ROOT / "docs/cli.md").read_text()
-    assert all(f"| {code} |" in page for code in (0, 1, 2, 130))
+    assert all(f"| {code} |" in page for code in (0, 1, 2, 130, 143))
 
 
 def test_the_page_of_the_command_line_names_every_verb() -> None:
@@ -233,9 +234,7 @@ def test_evaluate_without_a_policy(rhmc: Rhmc) -> None:
     said = rhmc("evaluate", "studies/x.yaml")
     assert said == (2, "", "x (quick): no such run has a policy yet; `rhmc study run` trains it\n")
     assert rhmc("evaluate", "studies/x.yaml", "--arm", "ful").err.endswith("did you mean 'full'?\n")
-    assert (
-        rhmc("evaluate", "p.pt").err == "config.yaml: no such file; --config names the config.yaml that the run keeps\n"
-    )
+    assert rhmc("evaluate", "p.pt") == (2, "", "p.pt: no such file\n")
 
 
 @pytest.mark.parametrize("level", ["ok", "note", "fault"])
@@ -263,8 +262,11 @@ def test_run_hands_on_the_study_the_work_folder_and_the_exit_code(
 def test_export_goes_to_the_folder_of_the_profile(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[tuple[Any, ...]] = []
     monkeypatch.setattr("pipelines.export.export_study", lambda study, out: calls.append((study.name, out)) or 1)
-    assert rhmc("export", "studies/x.yaml", "--profile", "paper").code == 1
-    assert rhmc("export", "studies/x.yaml", "--out", "there").code == 1
+    report = "next:  rhmc report --study studies/x.yaml"
+    assert rhmc("export", "studies/x.yaml", "--profile", "paper") == (1, "", f"{report} --profile paper\n")
+    assert rhmc("export", "studies/x.yaml", "--out", "there") == (1, "", f"{report} --runs there\n")
+    monkeypatch.setattr("pipelines.export.export_study", lambda study, out: 2)
+    assert rhmc("export", "studies/x.yaml") == (2, "", "")
     assert calls == [("x", Path("reports/paper/runs")), ("x", Path("there"))]
 
 
@@ -423,9 +425,15 @@ class Server:
     given: tuple[list[str], dict[str, str]]
     pid = 4711
 
-    def __init__(self, command: list[str], env: dict[str, str], *, start_new_session: bool) -> None:
+    def __init__(
+        self, command: list[str], env: dict[str, str], *, start_new_session: bool, stdout: IO[bytes], stderr: int
+    ) -> None:
         assert start_new_session
+        stdout.write(b"talk")
         Server.given = command, env
+
+    def poll(self) -> None:
+        """It runs."""
 
     def wait(self, timeout: float | None = None) -> int:
         if timeout is None:
@@ -448,19 +456,44 @@ def test_ui_serves_the_store_on_this_machine_only_until_ctrl_c(
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     killed: list[tuple[int, int]] = []
-    monkeypatch.setattr(ui, "subprocess", SimpleNamespace(Popen=Server))
+    monkeypatch.setattr(ui, "subprocess", SimpleNamespace(Popen=Server, STDOUT=-2))
     monkeypatch.setattr(ui.os, "killpg", lambda *given: killed.append(given))
     monkeypatch.setattr(ui.signal, "signal", lambda *given: None)
+    asked = iter([OSError("not yet"), io.BytesIO()])
+
+    def answer(address: str, timeout: float) -> io.BytesIO:
+        assert address == f"http://127.0.0.1:{port}/health"
+        now = next(asked)
+        if isinstance(now, OSError):
+            raise now
+        return now
+
+    monkeypatch.setattr("urllib.request.urlopen", answer)
+    monkeypatch.setattr("pipelines.mlflow_tracker.addresses", lambda *given: [("a", "One", "x"), ("a", "Two", "y")])
     said = rhmc("ui", "--port", str(port))
+    assert list(asked) == []  # it waited for the server
+    assert said.out.endswith(" ends it)\n\na\n  One:            x\n  Two:            y\n")
     assert killed == [(Server.pid, signal.SIGTERM)]
     command, env = Server.given
     assert said.code == 0
     assert said.out.startswith(f"http://127.0.0.1:{port}/#/experiments?workflowType=machine_learning ")
     options = dict(zip(command[4::2], command[5::2], strict=True))
     assert options["--backend-store-uri"] == f"sqlite:///{store}"
+    assert (store.parent / "ui.log").read_text() == "talk"
     assert (options["--host"], options["--port"], options["--workers"]) == ("127.0.0.1", str(port), "1")
     assert env["MLFLOW_SERVER_ENABLE_JOB_EXECUTION"] == "false"
     assert env["MLFLOW_DISABLE_TELEMETRY"] == "true"
+
+
+def test_ui_tells_no_address_of_a_server_that_ended_at_once(
+    rhmc: Rhmc, store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ended = SimpleNamespace(poll=lambda: 3, wait=lambda: 3)
+    monkeypatch.setattr(ui, "subprocess", SimpleNamespace(Popen=lambda command, **options: ended, STDOUT=-2))
+    monkeypatch.setattr(ui, "_free", lambda port: None)
+    monkeypatch.setattr(ui.signal, "signal", lambda *given: None)
+    why = f"rhmc: MLflow's server ended with exit code 3; {store.parent}/ui.log says why\n"
+    assert rhmc("ui") == (1, "", why)
 
 
 def test_sigterm_ends_the_server_and_its_workers(tmp_path: Path) -> None:
@@ -470,7 +503,7 @@ def test_sigterm_ends_the_server_and_its_workers(tmp_path: Path) -> None:
         "real = subprocess.Popen\n"
         f"server = ['sh', '-c', 'sleep 600 & echo $! > {file}.part; mv {file}.part {file}; wait']\n"
         "ui.subprocess.Popen = lambda command, **options: real(server, **options)\n"
-        "ui._serve('sqlite:///x', Path('.'), 1, [])\n"
+        f"ui._serve('sqlite:///x', Path('{tmp_path}/artifacts'), 1, [])\n"
     )
     process = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.DEVNULL)
     while not file.exists():

@@ -9,6 +9,7 @@ from pipelines.errors import InputError
 from pipelines.evaluation import Bank, Policy, of_file, of_study, score
 from pipelines.mlflow_tracker import MlflowTracker
 from pipelines.plan import items, resolved_yaml, study_card
+from pipelines.policy import Saved, load, save
 from pipelines.store import Checkpoints, Home, save_atomically, without_replay
 from pipelines.study import RunSpec, Study
 from rhmc.algorithms import ALGORITHMS
@@ -64,7 +65,7 @@ def test_every_method_acts_with_other_numbers_on_the_pairwise_encoder_only(kind:
     for encoder in ("pairwise", "mlp"):
         one = of_kind(kind, encoder)
         trainer, last = trained(one)
-        policy = Policy("a", one, "finished", without_replay(trainer.state_dict())["algorithm"])
+        policy = Policy("a", Saved(one, without_replay(trainer.state_dict())["algorithm"]))
         assert score(policy, Bank()).values == final(last)
         if encoder == "pairwise":
             found = [score(policy, Bank(agents=n, targets=m)).values["return"] for n, m in ((3, 4), (5, 2))]
@@ -105,7 +106,7 @@ def test_a_study_gives_the_policies_of_its_runs(home: Path, tmp_path: Path, monk
     )
 
     found = list(of_study(study, home))
-    assert [(one.arm, one.source) for one in found] == [("done", "finished"), ("half", "at step 200")]
+    assert [(one.arm, one.saved.reached) for one in found] == [("done", "finished"), ("half", "at step 200")]
     assert score(found[0], Bank()).values == final(last)
     assert [one.arm for one in of_study(study, home, ["half"])] == ["half"]
     for given, said in [
@@ -115,6 +116,58 @@ def test_a_study_gives_the_policies_of_its_runs(home: Path, tmp_path: Path, monk
     ]:
         with pytest.raises(InputError, match=said):
             list(of_study(study, home, *given))
+
+
+def test_a_damaged_policy_of_the_log_is_named_by_its_run(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipelines.evaluation.fingerprint", lambda: CODE)
+    study = tiny()
+    tracker = MlflowTracker(study_card(study), Home(home))
+    run = tracker.start(items(study, CODE, "")[0].card)
+    (tmp_path / "policy.pt").write_bytes(b"weights")
+    run.artifact(tmp_path / "policy.pt")
+    run.finish("finished")
+    with pytest.raises(InputError) as error:
+        list(of_study(study, home))
+    assert str(error.value) == f"tiny / slow s0: the policy.pt that its run {run.ref} keeps is damaged"
+
+
+def test_a_run_under_way_is_read_and_left_alone(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipelines.evaluation.fingerprint", lambda: CODE)
+    study = tiny(points=2)
+    item = items(study, CODE, "")[0]
+    trainer = Trainer(item.spec.env, item.spec.algo, item.spec.trainer, item.spec.seed)
+    checkpoints = Checkpoints(Home(home).checkpoints(item.key))
+    next(trainer)
+    checkpoints.save(1, {"trainer": trainer.state_dict(), "history": [], "seconds": 0.0})
+    (checkpoints.folder / "00000002.pt").write_bytes(b"cut short")
+    (checkpoints.folder / "00000003.pt.17.part").write_bytes(b"being written")
+    (found,) = of_study(study, home)
+    assert found.saved.reached == "at step 0"
+    assert {file.name for file in checkpoints.folder.iterdir()} == {"00000001.pt", "00000002.pt", "00000003.pt.17.part"}
+
+
+def test_a_policy_that_names_its_run_needs_no_config_and_takes_its_arm_from_one(
+    policy: tuple[Path, Metrics], tmp_path: Path
+) -> None:
+    file, last = policy
+    save(tmp_path / "alone.pt", load(file))
+    (tmp_path / "sub").mkdir()
+    shutil.copy(tmp_path / "alone.pt", tmp_path / "sub")
+    found = score(of_file(tmp_path / "sub" / "alone.pt", None), Bank())
+    assert (found.arm, found.source, found.values) == ("iql", "finished", final(last))
+    assert of_file(tmp_path / "alone.pt", None).arm == "slow"
+    (tmp_path / "config.yaml").write_text((tmp_path / "config.yaml").read_text().replace("seed: 0", "seed: 7"))
+    assert of_file(tmp_path / "alone.pt", None).arm == "iql"  # of another run
+    assert of_file(tmp_path / "alone.pt", tmp_path / "config.yaml").saved.spec.seed == 7
+
+
+def test_a_state_of_other_code_is_one_line(policy: tuple[Path, Metrics]) -> None:
+    file, _ = policy
+    saved = load(file)
+    with pytest.raises(InputError, match=r"^slow s0: no state of 'iql' as this code has it \("):
+        score(Policy("slow", saved._replace(algorithm=saved.algorithm | {"q": {}})), Bank())
 
 
 def test_files_that_are_no_policy(policy: tuple[Path, Metrics], tmp_path: Path) -> None:
@@ -130,8 +183,10 @@ def test_files_that_are_no_policy(policy: tuple[Path, Metrics], tmp_path: Path) 
             of_file(tmp_path / name, None)
     (tmp_path / "sub").mkdir()
     shutil.copy(file, tmp_path / "sub")
-    with pytest.raises(InputError, match=r"config.yaml: no such file; --config names"):
+    with pytest.raises(InputError, match=r"policy.pt: does not say which run it is of"):
         of_file(tmp_path / "sub/policy.pt", None)
+    with pytest.raises(InputError, match=r"none.yaml: no such file; --config names"):
+        of_file(file, tmp_path / "none.yaml")
     for text in ("", "a: 1", "env: [", "[]"):
         (tmp_path / "c.yaml").write_text(text)
         with pytest.raises(InputError, match=r"c.yaml: not the config.yaml of a run"):

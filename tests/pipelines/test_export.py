@@ -4,9 +4,11 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+import torch
 
-from pipelines.export import METRICS, RUNS, export_study, write_tables
-from pipelines.plan import Item, study_card
+from pipelines.export import EXPORTED, METRICS, export_study, write_tables
+from pipelines.host import Host, host
+from pipelines.plan import Item, items, study_card
 from pipelines.store import StoreError
 from pipelines.study import RunSpec
 from pipelines.tracker import MemoryRun, MemoryTracker
@@ -47,13 +49,24 @@ def test_one_row_per_metric_and_point(tracker: MemoryTracker, tmp_path: Path) ->
     assert write_tables(tiny(), runs, tracker, tmp_path) == 0
     values, table = read(tmp_path)
     assert list(values) == METRICS.names == ["study", "arm", "seed", "run", "step", "metric", "value"]
-    assert list(table) == RUNS.names
+    assert list(table) == EXPORTED.names
     assert len(values) == 2 * 3 * 2
     assert values.equals(values.sort_values(list(values)[:6], ignore_index=True))
     slow = values[(values.arm == "slow") & (values.metric == "eval/return")]
     assert list(zip(slow.step, slow.value, strict=True)) == [(0, 0.0), (200, 200 / 3), (400, 400 / 3)]
     assert set(values.run) == {item.card.spec_id for item in runs}
     assert set(values.metric) == {"eval/return", "train/loss"}
+
+
+def test_where_a_run_was_started_is_told_where_it_is_known(tracker: MemoryTracker, tmp_path: Path) -> None:
+    here, unknown = items(tiny(), CODE, "abc", Host("a machine", "torch 2"))[0], plan()[1]
+    log(tracker, here)
+    log(tracker, unknown)  # of an earlier version, or brought in from elsewhere
+    write_tables(tiny(), plan(), tracker, tmp_path)
+    told = read(tmp_path)[1].set_index("arm")[["machine", "versions"]]
+    assert told.loc["slow"].tolist() == ["a machine", "torch 2"]
+    assert told.loc["fast"].tolist() == ["", ""]
+    assert f"torch {torch.__version__}" in host().versions
 
 
 def test_one_row_per_planned_run(tracker: MemoryTracker, tmp_path: Path) -> None:

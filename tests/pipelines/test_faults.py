@@ -134,8 +134,8 @@ def test_two_studies_at_once_and_a_reader(tmp_path: Path, template: Path, whole:
     client, reads = MlflowClient(f"sqlite:///{home}/mlflow.db"), 0
     while any(driver.exitcode is None for driver in drivers):
         places = [place.experiment_id for place in client.search_experiments()]
-        for run in client.search_runs(places, order_by=["metrics.`eval/return` DESC"]):
-            client.get_metric_history(run.info.run_id, "eval/return")
+        for run in client.search_runs(places, order_by=["metrics.`return` DESC"]):
+            client.get_metric_history(run.info.run_id, "return")
         reads += 1
         time.sleep(0.02)
     said = (home / "driver.log").read_text()

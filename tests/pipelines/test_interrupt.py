@@ -10,10 +10,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 
-import psutil
 import pytest
 
 from pipelines.export import export_study
@@ -21,11 +19,11 @@ from pipelines.mlflow_tracker import open_existing
 from pipelines.plan import study_card
 from pipelines.run import run_study
 from pipelines.store import Home
+from tests.pipelines.chaos import WORKER, started_by
 from tests.pipelines.support import CODE, tiny
 
 pytestmark = pytest.mark.ray
 POINTS = 30
-WORKER = "Trainable"  # in what Ray calls the process, idle or training
 STUDY = tiny(points=POINTS)
 
 
@@ -63,16 +61,6 @@ def driver(home: Path) -> subprocess.Popen[str]:
     raise AssertionError(process.communicate()[0])
 
 
-def started_by(driver: int, name: str = "") -> list[psutil.Process]:
-    """What runs in the session of a driver, which may be gone, and has `name` in its command line."""
-    found = []
-    for process in psutil.process_iter():
-        with suppress(psutil.Error, OSError):
-            if os.getsid(process.pid) == driver and process.status() != psutil.STATUS_ZOMBIE:
-                found += [process] if name in " ".join(process.cmdline()) else []
-    return found
-
-
 def all_end(driver: int, name: str = "") -> bool:
     """Whether nothing that a driver started, with `name` in its command line, is left within a minute."""
     for _ in range(600):
@@ -101,7 +89,7 @@ def finish(home: Path, expected: bytes) -> None:
     tracker = open_existing(study_card(STUDY), Home(home))
     assert tracker is not None
     for ref in after:
-        history = tracker.client.get_metric_history(ref, "eval/return")
+        history = tracker.client.get_metric_history(ref, "return")
         assert sorted(value.step for value in history) == [200 * k for k in range(POINTS + 1)]
     assert not list(home.glob("checkpoints/*/*.pt"))
 

@@ -109,8 +109,13 @@ def test_the_newest_checkpoint_of_a_folder_is_read(tmp_path: Path) -> None:
     for point in (1, 2):
         state = state_of(one) | {"step": point}
         save_atomically(tmp_path / f"{point:08d}.pt", {"trainer": state, "spec": one.canonical()})
-    assert policy._file(tmp_path).name == "00000002.pt"
     assert policy.load(tmp_path).spec == one
+    assert policy.load(tmp_path).reached == "at step 2"
+    (tmp_path / "00000002.pt").write_bytes(b"cut short")
+    assert policy.load(tmp_path).reached == "at step 1"
+    (tmp_path / "00000001.pt").unlink()
+    with pytest.raises(InputError, match=r"00000002\.pt: not a readable checkpoint"):
+        policy.load(tmp_path)
 
 
 def test_what_is_no_policy(tmp_path: Path) -> None:
@@ -120,7 +125,7 @@ def test_what_is_no_policy(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     for name, said in {
         "text.pt": "text.pt: not a readable checkpoint",
-        "other.pt": "other.pt: a PyTorch file, but not a checkpoint of a run",
+        "other.pt": "other.pt: readable, but not a checkpoint of a run",
         "odd.pt": "odd.pt: not the settings of a run that this code knows",
         "empty": "empty: no policy.pt and no checkpoint in this folder",
         "none.pt": "none.pt: no such file",
@@ -178,24 +183,51 @@ def test_a_registered_policy_acts_in_a_fresh_process_as_the_trainer_evaluates(ho
     assert all(torch.equal(given, wanted) for given, wanted in zip(actions, done, strict=True))
 
 
-def test_a_model_that_a_killed_launch_left_unregistered_is_taken_up(
-    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+STEPS = (
+    *("create_logged_model", "log_model_artifacts", "finalize_logged_model", "log_outputs", "create_registered_model"),
+    *("create_model_version", "set_registered_model_alias", "set_logged_model_tags"),
+)
+
+
+@pytest.mark.parametrize("step", STEPS)
+@pytest.mark.parametrize("done", [False, True])
+def test_a_launch_killed_at_any_step_of_registering_leaves_one_model_to_the_next(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str, done: bool
 ) -> None:
+    one = run("iql")
+    policy.save(tmp_path / "policy.pt", Saved(one, made(one).state_dict()["algorithm"]))
+    tracker = MlflowTracker(STUDY, Home(home))
+    client, log = tracker.client, tracker.start(CARD)
+    real = getattr(client, step)
+
     def killed(*args: object, **options: object) -> None:
+        if done:
+            real(*args, **options)
         raise KeyboardInterrupt
 
+    with monkeypatch.context() as patch:
+        patch.setattr(client, step, killed)
+        with pytest.raises(KeyboardInterrupt):
+            log.model(tmp_path / "policy.pt")
+    log.model(tmp_path / "policy.pt")
+    (version,) = client.search_model_versions()
+    (model,) = client.search_logged_models([tracker.experiment])
+    (output,) = client.get_run(log.ref).outputs.model_outputs
+    assert (output.model_id, model.status, f"/{model.model_id}/" in version.source) == (model.model_id, "READY", True)
+    assert client.get_model_version_by_alias(version.name, "seed-5").version == version.version
+    assert version.name in model.tags["mlflow.modelVersions"]
+
+
+def test_a_version_that_a_dying_server_made_twice_is_kept_once(home: Path, tmp_path: Path) -> None:
     one = run("iql")
     policy.save(tmp_path / "policy.pt", Saved(one, made(one).state_dict()["algorithm"]))
     tracker = MlflowTracker(STUDY, Home(home))
     log = tracker.start(CARD)
-    with monkeypatch.context() as patch:
-        patch.setattr(tracker.client, "create_model_version", killed)
-        with pytest.raises(KeyboardInterrupt):
-            log.model(tmp_path / "policy.pt")
     log.model(tmp_path / "policy.pt")
     (version,) = tracker.client.search_model_versions()
-    outputs = tracker.client.get_run(log.ref).outputs.model_outputs
-    assert [f"/{output.model_id}/" in version.source for output in outputs] == [True]
+    tracker.client.create_model_version(version.name, version.source, log.ref)
+    log.model(tmp_path / "policy.pt")
+    assert [found.version for found in tracker.client.search_model_versions()] == [version.version]
 
 
 def test_a_policy_that_cannot_be_read_is_a_fault_of_the_store(home: Path, tmp_path: Path) -> None:

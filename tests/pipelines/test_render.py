@@ -9,8 +9,8 @@ import torch
 from PIL import Image
 from torch import Generator
 
-from pipelines import cli, drawing, policy, render
-from pipelines.drawing import Panel, Scene, animation
+from pipelines import animation, cli, policy, render
+from pipelines.animation import Panel, Scene, gif
 from pipelines.errors import InputError
 from pipelines.policy import Actor, Saved
 from pipelines.store import Home
@@ -18,6 +18,7 @@ from pipelines.study import RunSpec
 from pipelines.trainable import RunTrainable
 from rhmc.envs import coverage, navigation
 from rhmc.evaluate import evaluate
+from rhmc.scripted import BOUNDS
 from rhmc.trainer import Trainer
 from tests.pipelines.test_policy import run
 from tests.pipelines.test_trainable import finish, job, same
@@ -55,6 +56,20 @@ def test_two_policies_meet_the_same_targets() -> None:
     assert not torch.equal(third[0].state.targets, other[0].state.targets)
 
 
+def test_any_headings_see_what_the_bound_says() -> None:
+    env = coverage.Config(agents=2, targets=4)
+    free = render.panel(env, render.FREE, 5)
+    other = render.play(env, render.scripted(env, "best_window", 5), 5)
+    assert all(torch.equal(a.state.targets, b.state.targets) for a, b in zip(free, other, strict=True))
+    bound = [float(BOUNDS["coverage"][render.FREE](env, scene.state)) for scene in free[1:]]
+    assert free[-1].text.endswith(f"coverage so far {100 * sum(bound) / len(bound):.1f} %")
+    for scene, value in zip(free[1:], bound, strict=True):
+        seen = coverage.visible(*coverage.relation(scene.state))[0].any(0).float().mean()
+        assert float(seen) == pytest.approx(value)
+    with pytest.raises(InputError, match="'free_heading_bound' is not allowed; allowed: random, hold"):
+        render.panel(navigation.Config(agents=2), render.FREE, 5)
+
+
 # Pictures
 
 
@@ -69,7 +84,7 @@ def frames(gif: bytes) -> list[Image.Image]:
 
 def pixel(picture: Image.Image, x: float, y: float, half: float) -> tuple[int, ...]:
     """The colour at a point of the first panel."""
-    scale = drawing.SIDE / (2 * half)
+    scale = animation.SIDE / (2 * half)
     colour = picture.getpixel((round((x + half) * scale - 0.5), round((half - y) * scale - 0.5)))
     assert isinstance(colour, tuple)
     return colour
@@ -83,12 +98,12 @@ def test_a_sensor_looks_where_it_is_turned_to_and_a_seen_target_is_filled() -> N
         heading=torch.tensor([[90.0]]),  # upwards
         targets=torch.tensor([[[0.0, 500.0], [500.0, 0.0]]]),
     )
-    (picture,) = frames(animation(env, [Panel("", [Scene(state, torch.ones(1, 2), "")])], 1, 50))
-    half = drawing.COVERAGE_VIEW
-    assert pixel(picture, 0, 0, half) == drawing.TEAM[0]
-    assert pixel(picture, 0, 500, half) == drawing.SEEN
+    (picture,) = frames(gif(env, [Panel("", [Scene(state, torch.ones(1, 2), "")])], 1, 50))
+    half = animation.COVERAGE_VIEW
+    assert pixel(picture, 0, 0, half) == animation.TEAM[0]
+    assert pixel(picture, 0, 500, half) == animation.SEEN
     assert pixel(picture, 500, 0, half) == (255, 255, 255)  # a ring
-    assert pixel(picture, 500, 30, half) == drawing.MISSED
+    assert pixel(picture, 500, 30, half) == animation.MISSED
     inside, left, below = (pixel(picture, *place, half) for place in ((120, 600), (-600, 120), (0, -600)))
     assert inside != (255, 255, 255)
     assert left == below == (255, 255, 255)
@@ -101,9 +116,9 @@ def test_a_covered_landmark_is_green_and_the_view_grows_with_the_agents() -> Non
     state = state._replace(
         position=torch.tensor([[[0.5, 0.5], [0.0, -2.0]]]), landmarks=torch.tensor([[[0.5, 0.55], [-0.5, -0.5]]])
     )
-    (picture,) = frames(animation(env, [Panel("", [Scene(state, None, "")])], 1, 50))
+    (picture,) = frames(gif(env, [Panel("", [Scene(state, None, "")])], 1, 50))
     half = 2.2
-    assert pixel(picture, -0.5 + navigation.NEAR - 0.01, -0.5, half) == drawing.MISSED
+    assert pixel(picture, -0.5 + navigation.NEAR - 0.01, -0.5, half) == animation.MISSED
     assert pixel(picture, 0, -2.0, half) != (255, 255, 255)
     assert pixel(picture, 1.5, 1.5, half) == (255, 255, 255)
 
@@ -113,9 +128,9 @@ def test_the_last_step_is_shown_and_no_more_frames_than_wanted(steps: int, most:
     env = navigation.Config(agents=1)
     state = navigation.initial(env, 1, Generator().manual_seed(0))
     still = [Scene(state, None, f"step {k}") for k in range(steps)]
-    pictures = frames(animation(env, [Panel("", still)], most, 50))
+    pictures = frames(gif(env, [Panel("", still)], most, 50))
     assert len(pictures) == shown
-    last = frames(animation(env, [Panel("", still[-1:])], 1, 50))[0]
+    last = frames(gif(env, [Panel("", still[-1:])], 1, 50))[0]
     assert pictures[-1].tobytes() == last.tobytes()
 
 
@@ -124,8 +139,10 @@ def test_a_run_keeps_less_than_300_kb() -> None:
     gif = render.episode_gif(saved(one), frames=30)
     assert len(gif) < 300_000
     assert gif == render.episode_gif(saved(one), frames=30)
-    assert frames(gif)[0].size == (drawing.SIDE, drawing.SIDE + drawing.LINES)
-    assert frames(render.episode_gif(saved(one), beside="hold", frames=2))[0].width == 2 * drawing.SIDE
+    assert frames(gif)[0].size == (animation.SIDE, animation.SIDE + animation.LINES)
+    assert frames(render.episode_gif(saved(one), beside="hold", frames=2))[0].width == 2 * animation.SIDE
+    both = f"hold,{render.FREE}"
+    assert frames(render.episode_gif(saved(one), beside=both, frames=2))[0].width == 3 * animation.SIDE
 
 
 # In a run
@@ -188,6 +205,11 @@ def test_the_command_draws_a_file(
     }.items():
         assert rhmc(monkeypatch, *words) == 2
         assert capsys.readouterr().err == said
+    study = str(Path(__file__).parents[2] / "studies" / "ablation.yaml")
+    assert rhmc(monkeypatch, study, "--arm", "full", "--out", "b.gif") == 2
+    assert capsys.readouterr().err.startswith("ablation (quick): no such run has a policy yet; ")
+    assert rhmc(monkeypatch, study, "--arm", "ful", "--out", "b.gif") == 2
+    assert "--arm: 'ful' is not allowed; " in capsys.readouterr().err
     assert rhmc(monkeypatch, "policy.pt", "--out", "b.gif", "--beside", "best_windows") == 2
     said = capsys.readouterr().err
     assert said.startswith("--beside: 'best_windows' is not allowed; ")

@@ -1,9 +1,9 @@
 """From a plan to a log: the recorder with the twin and no Ray, then the whole chain."""
 
 import io
+import json
 import os
 import signal
-import socket
 import sys
 import threading
 from collections.abc import Callable
@@ -21,10 +21,10 @@ from ruamel.yaml import YAML
 from pipelines import progress, ray_driver, run, trainable
 from pipelines.export import export_study
 from pipelines.fingerprint import fingerprint
-from pipelines.mlflow_tracker import open_existing
-from pipelines.plan import Item, study_card, what_varies
+from pipelines.mlflow_tracker import MlflowTracker, open_existing
+from pipelines.plan import Item, items, study_card, what_varies
 from pipelines.progress import LiveBoard, PlainBoard, duration
-from pipelines.ray_driver import _knock, sockets
+from pipelines.ray_driver import sockets
 from pipelines.recorder import Recorder
 from pipelines.run import Interrupts, _arguments, animated, run_study, show_status
 from pipelines.store import Checkpoints, Home, StoreError
@@ -85,6 +85,21 @@ def test_a_finished_run_is_logged_whole_and_skipped_afterwards(launch: Launch, s
     again = launch()
     assert [item.key for item in again.todo()] == [fast]
     assert again.skipped == 1
+
+
+def test_what_was_logged_under_another_plan_is_set_aside_until_it_is_planned_again(
+    launch: Launch, shelf: list[MemoryRun]
+) -> None:
+    recorder = launch()
+    for key in [item.key for item in recorder.todo()]:
+        step(recorder, key)
+        finish(recorder, key)
+    launch(plan()[:1])
+    assert [run.tags for run in shelf] == [{}, {"stale": "yes"}]
+    launch(plan()[1:])
+    assert [run.tags for run in shelf] == [{"stale": "yes"}, {}]
+    assert launch().skipped == 2
+    assert [run.tags for run in shelf] == [{}, {}]
 
 
 def test_the_whole_configuration_is_kept(launch: Launch, shelf: list[MemoryRun]) -> None:
@@ -179,6 +194,20 @@ def test_what_another_process_trains_is_waited_for(launch: Launch, shelf: list[M
     assert [run.status for run in shelf] == ["interrupted", "interrupted"]
     assert recorder.again()
     assert not recorder.again()  # asked for once
+
+
+def test_a_run_whose_node_died_is_trained_once_more(launch: Launch, shelf: list[MemoryRun]) -> None:
+    recorder = launch()
+    key = recorder.todo()[0].key
+    recorder.start(key)
+    for node in ("host (a)", "host (b)"):
+        recorder.placed(key, node)
+    assert shelf[0].tags["nodes"] == "host (a), host (b)"
+    recorder.lost(key)
+    assert shelf[0].status == "interrupted"
+    assert recorder.again()
+    assert key in [item.key for item in recorder.todo()]
+    assert recorder.failures == {}
 
 
 def test_checkpoints_that_a_killed_launch_left_of_a_finished_run_go(launch: Launch) -> None:
@@ -304,6 +333,21 @@ def test_a_terminal_gets_a_line_per_running_run() -> None:
     for part in ("full s0", "500/1,000", "50 steps/s", "return 2.00", "10 s left", "full s1", "starting"):
         assert part in shown
     assert "full s0: finished, return 2.00" in out.getvalue()
+
+
+def test_runs_of_a_killed_driver_are_not_said_to_be_running(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    study = tiny()
+    plan = items(study, fingerprint(), "")
+    MlflowTracker(study_card(study), Home(home)).start(plan[0].card)
+
+    def slow() -> dict[str, int]:
+        assert show_status(study, home, as_json=True) == 1
+        arm: dict[str, int] = json.loads(capsys.readouterr().out)["arms"]["slow"]
+        return arm
+
+    with Home(home).lock(study.name, study.profile):
+        assert (slow()["running"], slow()["interrupted"]) == (1, 0)
+    assert (slow()["running"], slow()["interrupted"]) == (0, 1)
 
 
 # What may be in the way
@@ -433,7 +477,7 @@ def test_a_run_that_another_process_trains_is_trained_when_that_lets_go(
 
     monkeypatch.setattr(trainable, "PATIENCE", 0.0)
     monkeypatch.setattr(ray_driver, "fit", fit)
-    monkeypatch.setattr(ray_driver, "ray_session", lambda *args: nullcontext())
+    monkeypatch.setattr(ray_driver, "ray_session", lambda *args: nullcontext([]))
     key = f"{tiny().runs()[0].spec.id}-{fingerprint()}"
     Home(home).checkpoints(key).parent.mkdir()
     held = FileLock(f"{Home(home).checkpoints(key)}.lock")
@@ -569,13 +613,3 @@ def test_the_next_command_names_the_variant() -> None:
 def test_the_next_command_names_the_file_and_the_changes() -> None:
     study = Study.load(STUDIES / "coverage.yaml", "quick", ["seeds=1", "algo.alpha=0.1"])
     assert _arguments(study) == f"{STUDIES / 'coverage.yaml'} --profile quick --set seeds=1 --set algo.alpha=0.1"
-
-
-def test_a_cluster_that_is_not_there_is_one_line() -> None:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{free.getsockname()[1]}"
-    with pytest.raises(StoreError, match=f"RAY_ADDRESS={address}: .*refused"):
-        _knock(address)
-    _knock("auto")  # no place to knock at
-    _knock("ray://127.0.0.1:1")

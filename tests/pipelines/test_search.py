@@ -397,7 +397,7 @@ def test_the_log_has_a_run_for_each_trial(tmp_path: Path) -> None:
     world.launch()
     run = world.shelf[0]
     assert (run.card.name, run.status, run.tags["state"], run.tags["trial"]) == ("IQL t0", "finished", "complete", "0")
-    assert run.card.params.keys() == {"algo.lr", "algo.gamma"}
+    assert run.card.params.keys() == {"method", "algo.lr", "algo.gamma"}
     config = YAML(typ="safe").load(run.files["config.yaml"].decode())
     assert config["algo"]["lr"] == float(run.card.params["algo.lr"])
     assert config["seeds"] == [FIRST_SEED, FIRST_SEED + 1]
@@ -584,8 +584,8 @@ def test_the_winner_says_where_it_comes_from_and_a_study_includes_it(tmp_path: P
         "studies/found/search_x.iql.quick.yaml",
         "studies/found/search_x.vdn.quick.yaml",
     ]
-    assert set(tracker.kept) == {file.name for file in (*written.winners, *written.plots)}
-    assert {"iql.history.png", "vdn.importance.png"} <= set(tracker.kept)
+    assert set(tracker.files) == {file.name for file in (*written.winners, *written.plots)}
+    assert {"iql.history.png", "vdn.importance.png"} <= set(tracker.files)
     document = YAML(typ="safe").load(written.winners[0])
     said, best = document["provenance"], world.ledgers()[0].best()
     assert best is not None

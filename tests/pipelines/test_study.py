@@ -128,7 +128,7 @@ def test_methods_are_compared_on_one_task_and_one_encoder(name: str) -> None:
     assert {task.observation for task in tasks} == {"extended"}
 
 
-@pytest.mark.parametrize("name", ["ablation", "navigation", "scaling"])
+@pytest.mark.parametrize("name", ["ablation", "coverage", "navigation", "scaling"])
 def test_to_the_letter_every_method_has_the_papers_encoder_and_observation(name: str) -> None:
     path = ROOT / "studies" / f"{name}.yaml"
     study, strong = (Study.load(path, "paper", variant=variant) for variant in ("letter", None))
@@ -136,6 +136,31 @@ def test_to_the_letter_every_method_has_the_papers_encoder_and_observation(name:
     assert (study.name, strong.name) == (f"{name}@letter", name)
     for arm, setting in strong.arms.items():
         assert set(changes(setting, study.arms[arm])) == {"algo.encoder", "env.observation"}
+
+
+@pytest.mark.parametrize(
+    ("name", "shared"),
+    [
+        ("ablation", {"full": "RHMC", "IQL": "IQL"}),
+        ("alpha", {"alpha=0.02": "RHMC"}),
+        ("assignment_period", {"assignment_period=10": "RHMC"}),
+        ("scaling", {f"{arm}, agents=4": arm for arm in ("RHMC", "HiT-MAC", "QMIX", "VDN", "IQL", "COMA", "MAPPO")}),
+        ("scaling", {f"{arm}, agents=4": arm for arm in ("IPPO", "MADDPG")}),
+        (
+            "encoder",
+            {f"{arm}, encoder=pairwise, observation=extended": arm for arm in ("RHMC", "QMIX", "IQL", "MAPPO")},
+        ),
+    ],
+)
+def test_what_the_coverage_study_trains_is_not_trained_again(name: str, shared: dict[str, str]) -> None:
+    def ids(study: str) -> dict[str, set[str]]:
+        found: dict[str, set[str]] = {}
+        for run in Study.load(ROOT / "studies" / f"{study}.yaml", "paper").runs():
+            found.setdefault(run.arm, set()).add(run.spec.id)
+        return found
+
+    coverage, other = ids("coverage"), ids(name)
+    assert {arm: other[arm] for arm in shared} == {arm: coverage[there] for arm, there in shared.items()}
 
 
 @pytest.mark.parametrize("name", ["navigation", "scaling"])
@@ -146,15 +171,6 @@ def test_all_methods_are_there(name: str) -> None:
         by_size.setdefault(arm.env.agents, []).append(arm.algo.kind)
     assert sorted(by_size) == {"navigation": [3], "scaling": [2, 3, 4, 5, 6]}[name]
     assert all(sorted(kinds) == sorted(ALGORITHMS) for kinds in by_size.values())
-
-
-def test_the_sweeps_share_what_the_coverage_study_has_trained() -> None:
-    shared = {}
-    ids = {run.spec.id for run in Study.load(ROOT / "studies/coverage.yaml", "paper").runs()}
-    for name in ("scaling", "alpha", "assignment_period", "encoder"):
-        runs = Study.load(ROOT / "studies" / f"{name}.yaml", "paper").runs()
-        shared[name] = sum(run.spec.id in ids for run in runs)
-    assert shared == {"scaling": 27, "alpha": 3, "assignment_period": 3, "encoder": 12}
 
 
 def test_the_template_is_short_without_its_comments() -> None:

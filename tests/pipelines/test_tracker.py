@@ -10,12 +10,15 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from mlflow import MlflowClient
 
-from pipelines import mlflow_tracker
+from pipelines import histories, mlflow_tracker
+from pipelines.host import Host
 from pipelines.mlflow_tracker import MlflowTracker, open_existing
 from pipelines.names import shown
-from pipelines.store import Home, StoreError
+from pipelines.store import Home, StoreError, without_password
 from pipelines.tracker import Card, MemoryRun, MemoryTracker, Row, StudyCard, Tracker, points_of
+from tests.pipelines.chaos import Server
 
 STUDY = StudyCard("demo", "quick", "**Why?**")
 OTHER = StudyCard("other", "quick", "")
@@ -117,6 +120,16 @@ def test_the_status_is_kept_and_a_new_launch_reopens(opened: Open, status: str) 
     assert [run.status for run in tracker.recorded()] == ["interrupted"]
 
 
+def test_a_stale_run_is_marked_until_it_is_planned_again(opened: Open) -> None:
+    tracker = opened()
+    refs = [tracker.start(card).ref for card in (CARD, CARD._replace(spec_id="0ther"))]
+    assert [run.stale for run in tracker.recorded()] == [False, False]
+    tracker.mark(refs[0], stale=True)
+    assert [run.stale for run in opened().recorded()] == [True, False]
+    opened().mark(refs[0], stale=False)
+    assert [run.stale for run in opened().recorded()] == [False, False]
+
+
 def test_a_launch_leaves_other_studies_alone(opened: Open) -> None:
     opened(OTHER).start(CARD)
     tracker = opened()
@@ -167,8 +180,11 @@ def test_how_a_run_looks_in_mlflow(home: Path) -> None:
         "mlflow.parentRunId": tracker.parent,
     }
     assert run.data.tags.items() >= expected.items()
-    assert parent.data.tags["mlflow.note.content"] == "**Why?**"
-    assert tracker.client.get_experiment(run.info.experiment_id).tags["mlflow.note.content"] == "**Why?**"
+    assert "machine" not in run.data.tags  # not known: no empty word
+    tracker.start(CARD._replace(spec_id="other", host=Host("a machine", "torch 2"))).finish("finished")
+    assert {run.key: run.host for run in tracker.recorded()}["other-c0de"] == ("a machine", "torch 2")
+    assert parent.data.tags["mlflow.note.content"].startswith("**Why?** [Curves by arm](#/experiments/")
+    assert tracker.client.get_experiment(run.info.experiment_id).tags["mlflow.note.content"].startswith("**Why?** [")
     assert tracker.file(log.ref, "none.pt", home) is None
     (home / "copy").mkdir()
     kept = tracker.file(log.ref, "policy.pt", home / "copy")
@@ -267,6 +283,36 @@ def test_listing_at_once_and_through_the_client_agree(home: Path) -> None:
     assert tracker._listed_sqlite([]) == tracker._listed_client([]) == []
 
 
+def test_a_server_is_asked_for_a_metric_of_many_runs_at_once(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    server = Server(home)
+    server.start()
+    asked: list[list[str]] = []
+    page, one = histories.http_request, MlflowClient.get_metric_history
+    monkeypatch.setattr(histories, "http_request", lambda *a, **k: asked.append(k["params"]["run_id"]) or page(*a, **k))
+    monkeypatch.setattr(MlflowClient, "get_metric_history", lambda *a: asked.append(a[1:2]) or one(*a))
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", server.uri)
+    try:
+        tracker = MlflowTracker(STUDY, Home(home))
+        runs = [tracker.start(CARD._replace(spec_id=f"s{number}")) for number in range(3)]
+        for number, run in enumerate(runs):
+            run.log([point(step, **{"eval/odd": math.nan, "eval/max": math.inf}) for step in range(8 * (number + 1))])
+        refs, asked[:] = [run.ref for run in runs], []
+        found = tracker.rows(refs)
+        with monkeypatch.context() as patch:
+            patch.setattr(tracker, "uri", f"sqlite:///{home}/mlflow.db")
+            alone = tracker.rows(refs)
+        assert [len(refs) for refs in asked] == [3] * 4  # one for each metric
+        assert str(found) == str(alone)
+        assert len(found) == 4 * (8 + 16 + 24)
+        for most in (17, 1):  # more than an answer holds: some are asked for in halves, some one by one
+            monkeypatch.setattr(histories, "VALUES", most)
+            assert str(tracker.rows(refs)) == str(found)
+        monkeypatch.setattr(histories, "PAGE", "/api/none")  # a server that has no such page
+        assert str(tracker.rows(refs)) == str(found)
+    finally:
+        server.kill()
+
+
 def test_a_long_history_is_logged_in_requests_of_a_thousand(home: Path) -> None:
     tracker = MlflowTracker(STUDY, Home(home))
     run = tracker.start(CARD)
@@ -344,6 +390,21 @@ def test_a_server_that_does_not_answer(home: Path, monkeypatch: pytest.MonkeyPat
         uri = f"http://127.0.0.1:{free.getsockname()[1]}"
     monkeypatch.setenv("MLFLOW_TRACKING_URI", uri)
     assert refused(home).startswith(f"{uri}: the MLflow server does not answer")
+
+
+def test_a_password_is_shown_nowhere(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for uri in ("http://me:secret@127.0.0.1:1", "postgresql://me:secret@127.0.0.1:1/mlflow"):
+        monkeypatch.setenv("MLFLOW_TRACKING_URI", uri)
+        said = refused(home)
+        assert said.startswith(uri.replace("secret", "***"))
+        assert "refused" in said
+        assert "secret" not in said
+    assert without_password("http://[") == "http://["
+
+
+def test_an_address_without_its_kind(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "127.0.0.1:5000")
+    assert refused(home).startswith("MLFLOW_TRACKING_URI=127.0.0.1:5000: not an address; http://HOST:PORT")
 
 
 def test_a_store_in_no_folder(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from pipelines import store
+from pipelines.cluster import here
 from pipelines.store import Checkpoints, StoreError, load_whole, save_atomically, without_replay
 from pipelines.trainable import RunTrainable
 from rhmc.algorithms import ALGORITHMS
@@ -229,7 +230,13 @@ def test_a_stop_saves_the_run_at_its_next_point(start: Start, tmp_path: Path) ->
     (tmp_path / "a" / "stop").touch()
     result = run.step()
     assert (result["done"], result["stopped"]) == (True, True)
-    assert start("a").step() == {"done": True, "stopped": True, "points": [], "seconds": 0.0}  # and none begins
+    assert start("a").step() == {
+        "done": True,
+        "stopped": True,
+        "points": [],
+        "seconds": 0.0,
+        "place": here(),
+    }  # none begins
     run.cleanup()
     (tmp_path / "a" / "stop").unlink()
     assert len(start().step()["points"]) == 3
@@ -247,7 +254,14 @@ def test_a_process_goes_on_with_the_next_run(start: Start, tmp_path: Path) -> No
 def test_a_run_is_trained_by_one_process_at_a_time(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pipelines.trainable.PATIENCE", 0.0)
     run = start()
-    assert start().step() == {"done": True, "stopped": True, "busy": True, "points": [], "seconds": 0.0}
+    assert start().step() == {
+        "done": True,
+        "stopped": True,
+        "busy": True,
+        "points": [],
+        "seconds": 0.0,
+        "place": here(),
+    }
     run.cleanup()
     assert len(start().step()["points"]) == 1
 

@@ -1,16 +1,32 @@
 """Fixtures of the reports' tests."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from reports import stats
+from reports.build import build
+from tests.reports.factory import drawings, episode, half_done, methods, noisy, study, theorem, write, yardsticks
 
 
 @pytest.fixture
 def quick_resampling(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """A tenth of the resamples, where many intervals are made."""
-    stats._picks.cache_clear()
+    for kept in (stats._picks, stats._shares):
+        kept.cache_clear()
     monkeypatch.setattr(stats, "RESAMPLES", stats.RESAMPLES // 10)
     yield
-    stats._picks.cache_clear()
+    for kept in (stats._picks, stats._shares):
+        kept.cache_clear()
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A whole report with a half-finished study."""
+    folder, out = tmp_path_factory.mktemp("tables"), tmp_path_factory.mktemp("report")
+    ablation = study("ablation", {"full": noisy(70), "no regulation": noisy(60), "no filter": noisy(64)}, points=4)
+    other = half_done(*study("reach", {"one <step>": noisy(67), "six steps": noisy(63)}, points=4))
+    write(drawings(episode(methods(folder))), ablation, other, yardsticks(), theorem())
+    build(folder, out, "quick")
+    return out

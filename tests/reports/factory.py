@@ -107,6 +107,15 @@ def methods(folder: Path, names: Sequence[str] = ("RHMC", "IQL")) -> Path:
     return folder
 
 
+def half_done(points: pd.DataFrame, runs: pd.DataFrame) -> Tables:
+    """A seed missing, a seed half-way, all others as they were."""
+    gone, cut = runs["run"].iloc[0], runs["run"].iloc[1]
+    keep = (points["run"] != gone) & ~((points["run"] == cut) & (points["step"] > 75_000))
+    keep &= ~((points["run"] == cut) & points["metric"].str.startswith("final/"))
+    status = np.select([runs["run"] == gone, runs["run"] == cut], ["missing", "partial"], "finished")
+    return points[keep], runs.assign(status=status)
+
+
 def write(folder: Path, *tables: Tables) -> Path:
     """Write tables as an export does, one pair of files per study."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -192,3 +201,36 @@ def _network(role: str) -> dict[str, Any]:
         "layers": [every[0], relu, *every[1:]],
         "edges": [{"from": a, "to": b, "through": ["sum"] if b == "d" else []} for a, b in edges],
     }
+
+
+def episode(folder: Path) -> Path:
+    """What `rhmc render` writes, the smallest: a GIF of two by one pixels."""
+    gif = bytes.fromhex("47494638396102000100800000ffffff00000021f90400000000002c00000000020001000002020c0a003b")
+    (folder / "episode_coverage.gif").write_bytes(gif)
+    return folder
+
+
+def assignments(points: pd.DataFrame, arm: str, pairs: Sequence[float], lost: Sequence[float]) -> pd.DataFrame:
+    """What `rhmc assignments` writes of an arm's first run: a point at every 1000 steps."""
+    place = points[points["arm"] == arm].iloc[0][["study", "arm", "seed", "run"]].to_dict()
+    rows = [
+        place | {"step": 1000 * (n + 1), "metric": f"assign/{name}", "value": value}
+        for n, (p, x) in enumerate(zip(pairs, lost, strict=True))
+        for name, value in (
+            *(("pairs", p), ("conflicts", p / 4), ("free", 0.5), ("idle", 0.25), ("states", 100.0 * (n + 1))),
+            *(("lost_h1", 0.0), ("gap_h1", 0.0), ("lost_h6", x), ("gap_h6", 0.4 + n)),
+        )
+    ]
+    return pd.DataFrame(rows, columns=list(POINTS))
+
+
+def transfer(points: pd.DataFrame, levels: Mapping[tuple[int, int], float], arm: str = "RHMC") -> pd.DataFrame:
+    """What `rhmc transfer` writes: every seed of an arm a point apart at each size."""
+    runs = points[points["arm"] == arm].drop_duplicates("run")
+    rows = [
+        (r.study, r.arm, r.seed, r.run, "coverage flat", n, m, 4, 5, 200, level + float(str(r.seed)), 0.5)
+        for r in runs.itertuples()
+        for (n, m), level in levels.items()
+    ]
+    columns = ["study", "arm", "seed", "run", "task", "agents", "targets", "trained_agents", "trained_targets"]
+    return pd.DataFrame(rows, columns=[*columns, "episodes", "value", "sem"])

@@ -78,6 +78,12 @@ def test_c3(tmp_path: Path, level: float, others: Mapping[str, float], verdict: 
         assert found.reason.endswith("no results of HiT-MAC, QMIX, COMA, MAPPO and MADDPG.")
 
 
+def test_rhmc_with_other_settings_is_no_other_method(tmp_path: Path) -> None:
+    points, runs = study("coverage", arms(70.5, OTHERS | {"RHMC mixed": 80.0}), steps=PAPER)
+    runs = runs.assign(algorithm=runs["algorithm"].replace("rhmc mixed", "rhmc"))
+    assert verdicts(tmp_path, (points, runs))["C3"].verdict == "reproduced"
+
+
 def test_c1_and_c2(tmp_path: Path) -> None:
     levels = {"HiT-MAC": -30.0, "QMIX": -40.0, "IQL": -35.0, "COMA": -45.0, "MAPPO": -30.0, "MADDPG": -36.0}
 
@@ -140,7 +146,7 @@ def sensors(ours: Sequence[float], theirs: Sequence[float]) -> Tables:
     parts = [
         study(
             "scaling",
-            {f"RHMC, {n}": noisy(x, 5), f"IQL, {n}": noisy(y, 5)},
+            {f"RHMC, {n} sensors": noisy(x, 5), f"IQL, {n} sensors": noisy(y, 5)},
             env=COVERAGE | {"agents": n},
             steps=PAPER,
         )

@@ -30,6 +30,11 @@ def not_finite(points: pd.DataFrame, runs: pd.DataFrame) -> Tables:
     return points.assign(value=points["value"].mask(at(points, "final/return"), np.nan)), runs
 
 
+def hole_in_a_curve(points: pd.DataFrame, runs: pd.DataFrame) -> Tables:
+    here = at(points, "eval/return") & (points["step"] == 75_000)
+    return points.assign(value=points["value"].mask(here, np.nan)), runs
+
+
 def infinite(points: pd.DataFrame, runs: pd.DataFrame) -> Tables:
     return points.assign(value=points["value"].mask(at(points, "final/return"), np.inf)), runs
 
@@ -84,6 +89,7 @@ def words(points: pd.DataFrame, runs: pd.DataFrame) -> Tables:
     ("plant", "line"),
     [
         (not_finite, "ablation, arm 'full', seed 1, run {run}, step 150000: final/return is nan"),
+        (hole_in_a_curve, "ablation, arm 'full', seed 1, run {run}, step 75000: eval/return is nan"),
         (infinite, "ablation, arm 'full', seed 1, run {run}, step 150000: final/return is inf"),
         (doubled, "ablation, arm 'full', seed 1, run {run}: eval/return at step 0 stands there twice"),
         (hole, "ablation, arm 'full', seed 1: planned for other arms, and not for this one"),

@@ -134,3 +134,12 @@ def test_curve_with_a_seed_behind() -> None:
     assert rows["n"].tolist() == [3, 2, 1]
     assert rows["low"].tolist()[0] == 1.0
     assert rows[["low", "high"]].iloc[2].isna().all()
+
+
+def test_a_curve_has_the_interval_of_every_point() -> None:
+    rng = np.random.default_rng(5)
+    rows = [(seed, step, rng.normal(60, 4)) for seed in range(6) for step in range(0, 90, 10) if seed < 4 or step < 50]
+    points = pd.DataFrame(rows, columns=["seed", "step", "value"])
+    for row in stats.curve(points).itertuples():
+        own = stats.interval(points[points["step"] == row.step]["value"].to_numpy())
+        assert (row.mean, row.low, row.high, row.n) == pytest.approx(tuple(own))

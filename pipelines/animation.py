@@ -38,7 +38,7 @@ class Panel(NamedTuple):
     scenes: Sequence[Scene]
 
 
-def animation(env: EnvConfig, panels: Sequence[Panel], frames: int, milliseconds: int) -> bytes:
+def gif(env: EnvConfig, panels: Sequence[Panel], frames: int, milliseconds: int) -> bytes:
     """The panels side by side as a GIF.
 
     Args:

@@ -1,0 +1,103 @@
+"""The page in a real browser: it opens without a word on the console, sorts, and its links lead somewhere.
+
+A script that is added to a copy of the page clicks and looks; what it found stands in the page that comes back.
+"""
+
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+BROWSER = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+pytestmark = pytest.mark.skipif(
+    BROWSER is None, reason=f"no browser here: none of {', '.join(BROWSERS)} is on the path"
+)
+
+PROBE = """
+<script>
+const column = (id, n) => [...document.querySelectorAll(`#${id} tbody tr`)].map((row) => row.cells[n].textContent);
+const click = (id, n) => document.querySelectorAll(`#${id} th button`)[n].click();
+const found = {before: column("table-final_ablation", 1)};
+click("table-final_ablation", 1);
+found.up = column("table-final_ablation", 1);
+found.said = document.getElementById("said").textContent;
+found.state = [...document.querySelectorAll("#table-final_ablation th")].map((head) => head.getAttribute("aria-sort"));
+click("table-final_ablation", 1);
+found.down = column("table-final_ablation", 1);
+click("table-final_reach", 1);
+found.reach = column("table-final_reach", 1);
+const links = [...document.querySelectorAll("a[href]")].map((link) => link.getAttribute("href"));
+found.lost = links.filter((href) => href.startsWith("#") && !document.getElementById(href.slice(1)));
+found.files = links.filter((href) => !href.startsWith("#"));
+found.blank = [...document.images].filter((image) => !image.naturalWidth).length;
+found.unnamed = [...document.images].filter((image) => image.alt.length < 20).length;
+found.images = document.images.length;
+found.wide = document.documentElement.scrollWidth - document.documentElement.clientWidth;
+const run = document.querySelector("#C8 a[href^='#run-']").getAttribute("href");
+found.folded = !document.querySelector(run).closest("details").open;
+location.hash = run;
+setTimeout(() => {
+  found.unfolded = document.querySelector(run).closest("details").open;
+  document.title = "FOUND" + JSON.stringify(found) + "END";
+}, 200);
+</script>
+"""
+
+
+class Seen(NamedTuple):
+    """What the probe found, and what stood on the console."""
+
+    found: dict[str, Any]
+    console: list[str]
+
+
+def visit(page: Path, size: str = "1280,900", scheme: str = "light") -> Seen:
+    command = [str(BROWSER), "--headless=new", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr"]
+    command += [f"--window-size={size}", "--virtual-time-budget=4000", f"--user-data-dir={page.parent / 'profile'}"]
+    command += ["--force-dark-mode"] if scheme == "dark" else []
+    done = subprocess.run([*command, "--dump-dom", page.as_uri()], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr[-500:]
+    match = re.search(r"<title>FOUND(.*?)END</title>", done.stdout, re.DOTALL)
+    assert match, done.stderr[-500:]
+    found = json.loads(match[1].replace("&amp;", "&").replace("&lt;", "<").replace("&gt;", ">"))
+    return Seen(found, [line for line in done.stderr.splitlines() if "CONSOLE" in line])
+
+
+def copy(made: Path, folder: Path, more: str = "") -> Path:
+    page = folder / "index.html"
+    page.write_text((made / "index.html").read_text().replace("</body>", f"{PROBE}{more}</body>"))
+    return page
+
+
+def test_it_opens_sorts_and_leads_on(made: Path, tmp_path: Path) -> None:
+    found, console = visit(copy(made, tmp_path))
+    assert console == []
+    assert found["before"] == ["70.0 [69.0, 71.0]", "64.0 [63.0, 65.0]", "60.0 [59.0, 61.0]"]
+    assert found["up"] == found["before"][::-1]
+    assert found["down"] == found["before"]
+    assert found["state"] == [None, "ascending", None, None, None]
+    assert found["said"].startswith("Final results of study ablation sorted by Final return")
+    assert found["reach"] == ["63.0 [62.0, 64.0]", "68.0"]
+    assert found["lost"] == []
+    assert len(found["files"]) > 20
+    assert [name for name in found["files"] if not (made / name).exists()] == []
+    assert (found["blank"], found["unnamed"]) == (0, 0)
+    assert found["images"] > 8
+    assert found["folded"]
+    assert found["unfolded"]
+
+
+@pytest.mark.parametrize(("size", "scheme"), [("500,900", "light"), ("1280,900", "dark")])
+def test_nothing_reaches_out_of_a_narrow_or_dark_page(made: Path, tmp_path: Path, size: str, scheme: str) -> None:
+    found, console = visit(copy(made, tmp_path), size, scheme)
+    assert found["wide"] <= 0
+    assert console == []
+
+
+def test_an_error_on_the_console_would_be_seen(made: Path, tmp_path: Path) -> None:
+    assert "nowhere" in visit(copy(made, tmp_path, "<script>console.error('nowhere')</script>")).console[0]
