@@ -338,7 +338,8 @@ def main() -> None:
                 with tempfile.TemporaryDirectory() as folder:
                     several.append(Account(launch(side, args.minutes, Path(folder))))
                 print(line(f"{side} {i + 1}", several[-1]), flush=True)
-    print(f"\n{parts(accounts['platform'])}\n\n{verdict(accounts)}")
+    if accounts["platform"]:
+        print(f"\n{parts(accounts['platform'])}\n\n{verdict(accounts)}")
 
 
 def verdict(accounts: dict[str, list[Account]]) -> str:
@@ -347,6 +348,8 @@ def verdict(accounts: dict[str, list[Account]]) -> str:
     texts = [f"{side}: {share:.1%} of training's processor seconds" for side, share in spent.items()]
     if len(spent) == 2:
         texts.append(f"the difference, which is the platform: {spent['platform'] - spent['bare']:.1%}")
+        over = {side: median(sum(a.cpus.values()) - a.training_cpu for a in accounts[side]) for side in spent}
+        texts.append(f"{over['platform']:.1f} s and {over['bare']:.1f} s")
     ends = {tuple(account.returns) for several in accounts.values() for account in several}
     return f"Beside training, {'; '.join(texts)}. Final returns: {'equal' if len(ends) == 1 else f'DIFFERENT, {ends}'}."
 

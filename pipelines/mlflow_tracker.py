@@ -123,9 +123,8 @@ class MlflowTracker:
         if arms != known:
             self.client.set_experiment_tag(self.experiment, ARMS, json.dumps(arms, ensure_ascii=False))
         for run in self._search(f"tags.role = 'run' and tags.{legend.TAG} IS NULL"):  # of an earlier version
-            self.client.log_batch(
-                run.info.run_id, tags=[RunTag(*pair) for pair in self._look(run.data.tags["variant"], arms)]
-            )
+            look = self._look(run.data.tags.get("variant", ""), arms)
+            self.client.log_batch(run.info.run_id, tags=[RunTag(*pair) for pair in look])
         return arms
 
     @staticmethod
@@ -518,8 +517,9 @@ def open_existing(study: StudyCard, home: Home) -> MlflowTracker | None:
 
 def _recorded(ref: str, status: str, tags: Mapping[str, str]) -> Recorded:
     known: dict[str, str] = defaultdict(str, tags)
-    key, host = f"{known['spec']}-{known['fingerprint']}", Host(known["machine"], known["versions"])
-    return Recorded(ref, known["variant"], key, FROM_MLFLOW[status], known["commit"], views.STALE in known, host)
+    key = f"{known['spec']}-{known['fingerprint']}"
+    stale, host = views.STALE in tags, Host(known["machine"], known["versions"])
+    return Recorded(ref, known["variant"], key, FROM_MLFLOW[status], known["commit"], stale, host)
 
 
 # What may be in the way

@@ -268,6 +268,21 @@ def test_reading_at_once_and_through_the_client_agree(home: Path) -> None:
     assert len(tracker.rows(refs, some)) == 2 * 2 * 5
 
 
+def test_listing_at_once_and_through_the_client_agree(home: Path) -> None:
+    tracker = MlflowTracker(STUDY, Home(home))
+    other = MlflowTracker(OTHER, Home(home))
+    for seed, status in enumerate(("finished", "failed", "interrupted", "finished")):
+        tracker.start(CARD._replace(seed=seed, spec_id=f"s{seed}")).finish(status)
+    other.start(CARD)
+    deleted = tracker.start(CARD._replace(spec_id="deleted"))
+    tracker.client.delete_run(deleted.ref)
+    everywhere = [tracker.experiment, other.experiment]
+    found = tracker._listed_sqlite(everywhere)
+    assert found == tracker._listed_client(everywhere)
+    assert [run.status for _, run in found] == ["finished", "failed", "interrupted", "finished", "running"]
+    assert tracker._listed_sqlite([]) == tracker._listed_client([]) == []
+
+
 def test_a_server_is_asked_for_a_metric_of_many_runs_at_once(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     server = Server(home)
     server.start()
@@ -298,21 +313,6 @@ def test_a_server_is_asked_for_a_metric_of_many_runs_at_once(home: Path, monkeyp
         assert str(tracker.rows(refs)) == str(found)
     finally:
         server.kill()
-
-
-def test_listing_at_once_and_through_the_client_agree(home: Path) -> None:
-    tracker = MlflowTracker(STUDY, Home(home))
-    other = MlflowTracker(OTHER, Home(home))
-    for seed, status in enumerate(("finished", "failed", "interrupted", "finished")):
-        tracker.start(CARD._replace(seed=seed, spec_id=f"s{seed}")).finish(status)
-    other.start(CARD)
-    deleted = tracker.start(CARD._replace(spec_id="deleted"))
-    tracker.client.delete_run(deleted.ref)
-    everywhere = [tracker.experiment, other.experiment]
-    found = tracker._listed_sqlite(everywhere)
-    assert found == tracker._listed_client(everywhere)
-    assert [run.status for _, run in found] == ["finished", "failed", "interrupted", "finished", "running"]
-    assert tracker._listed_sqlite([]) == tracker._listed_client([]) == []
 
 
 def test_a_long_history_is_logged_in_requests_of_a_thousand(home: Path) -> None:
