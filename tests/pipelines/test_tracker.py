@@ -395,12 +395,11 @@ def test_a_server_that_does_not_answer(home: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_a_password_is_shown_nowhere(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for uri in ("http://me:secret@127.0.0.1:1", "postgresql://me:secret@127.0.0.1:1/mlflow"):
-        monkeypatch.setenv("MLFLOW_TRACKING_URI", uri)
-        said = refused(home)
-        assert said.startswith(uri.replace("secret", "***"))
-        assert "refused" in said
-        assert "secret" not in said
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://me:secret@127.0.0.1:1")
+    said = refused(home)
+    assert said.startswith("http://me:***@127.0.0.1:1: the MLflow server does not answer")
+    assert "refused" in said
+    assert without_password("postgresql://me:secret@there/mlflow") == "postgresql://me:***@there/mlflow"
     assert without_password("http://[") == "http://["
 
 
