@@ -403,6 +403,17 @@ def test_a_password_is_shown_nowhere(home: Path, monkeypatch: pytest.MonkeyPatch
     assert without_password("http://[") == "http://["
 
 
+def test_a_database_server_that_is_not_there(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def never(*words: object) -> None:
+        raise AssertionError("MLflow tries for a minute and a half")
+
+    monkeypatch.setattr(mlflow_tracker, "MlflowClient", never)
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "postgresql://me:secret@127.0.0.1:1/mlflow")
+    said = refused(home)
+    assert said.startswith("postgresql://me:***@127.0.0.1:1/mlflow: MLflow cannot go on")
+    assert "refused" in said
+
+
 def test_an_address_without_its_kind(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MLFLOW_TRACKING_URI", "127.0.0.1:5000")
     assert refused(home).startswith("MLFLOW_TRACKING_URI=127.0.0.1:5000: not an address; http://HOST:PORT")
