@@ -30,6 +30,7 @@ import psutil
 
 import rhmc.evaluate
 import rhmc.trainer
+from pipelines.ray_settings import set_up_ray
 from pipelines.study import RunSpec, Study
 from pipelines.trainable import RunTrainable
 
@@ -163,10 +164,10 @@ def platform(changes: list[str], out: Path) -> None:
     import ray
     from ray import tune
 
-    from pipelines import cli, mlflow_tracker, overview, ray_driver, recorder, run
+    from pipelines import cli, mlflow_tracker, overview, ray_driver, recorder
 
     watch, runs = Stopwatch(), dict[str, dict[str, Any]]()
-    run.set_up_ray()
+    set_up_ray()
     watch.spent["import"] = [1, time.perf_counter() - start, 0.0]
     for owner, name, label in (
         (mlflow_tracker, "create_database", "make the database"),

@@ -30,6 +30,7 @@ import env_speed
 import psutil
 from platform_overhead import ROOT, Stopwatch
 
+from pipelines.ray_settings import set_up_ray
 from pipelines.study import RunSpec, Study
 from pipelines.trainable import RunTrainable
 from rhmc.trainer import Trainer, grid_step
@@ -104,7 +105,7 @@ def drive(file: Path, until: int, out: Path) -> None:
     """`rhmc study run`, interrupted after so many finished runs (0: not)."""
     from pipelines import cli, mlflow_tracker, overview, ray_driver, recorder, run
 
-    run.set_up_ray()
+    set_up_ray()
     import ray
 
     ray_driver.RunTrainable = Simulated  # type: ignore[misc]

@@ -11,11 +11,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pipelines.document import choices
 from pipelines.errors import InputError
-from pipelines.export import METRICS, write_parquet
+from pipelines.export import METRICS, read_parquet, write_parquet
 from pipelines.fingerprint import fingerprint
-from pipelines.plan import Item, items
+from pipelines.plan import Item, chosen, items
 from pipelines.study import Study
 from rhmc.regulation import exact, paper
 from rhmc.trainer import Trainer
@@ -97,19 +96,10 @@ def watched(study: Study, arms: Sequence[str] = (), seeds: Sequence[int] = ()) -
     Raises:
         InputError: there is no such arm, or none of the runs assigns targets.
     """
-    faults = [f"--arm: '{arm}' is not allowed; {choices(arm, study.arms)}" for arm in arms if arm not in study.arms]
-    if faults:
-        raise InputError("\n".join(faults))
-    chosen = [
-        item
-        for item in items(study, fingerprint(), "")
-        if item.spec.algo.kind in ASSIGNING
-        and (not arms or item.card.arm in arms)
-        and (not seeds or item.card.seed in seeds)
-    ]
-    if not chosen:
+    found = [item for item in chosen(study, fingerprint(), arms, seeds) if item.spec.algo.kind in ASSIGNING]
+    if not found:
         raise InputError(f"{study.name} ({study.profile}): no such run assigns targets; {' and '.join(ASSIGNING)} do")
-    for item in chosen:
+    for item in found:
         yield Watched(item, list(_train(item)))
 
 
@@ -140,21 +130,7 @@ def export_assignments(study: Study, rows: Sequence[Row], out: Path) -> Path:
     file = out / f"{study.name}{SUFFIX}"
     new = {row[3] for row in rows}
     known = {item.card.spec_id for item in items(study, fingerprint(), "")}
-    kept = [row for row in _read(file) if row[3] in known - new]
+    there = [tuple(row[name] for name in METRICS.names) for row in read_parquet(file, METRICS, "assignments")]
+    kept = [row for row in there if row[3] in known - new]
     write_parquet(file, METRICS, sorted([*kept, *rows], key=lambda row: row[:6]))
     return file
-
-
-def _read(file: Path) -> list[Row]:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    if not file.exists():
-        return []
-    try:
-        table = pq.read_table(file)
-    except (OSError, pa.ArrowException) as error:
-        raise InputError(f"{file}: not a readable table; move it away") from error
-    if table.schema.names != METRICS.names:
-        raise InputError(f"{file}: a table, but not one of assignments; move it away")
-    return [tuple(row[name] for name in METRICS.names) for row in table.to_pylist()]

@@ -145,9 +145,9 @@ def _places(count: Mapping[str, int]) -> str:
 
 def starts_ray(home: Path | None = None) -> list[Finding]:
     """Whether Ray starts here, or its cluster answers and every node can train with this work folder."""
-    from pipelines.run import RAY_SETTINGS
+    from pipelines.ray_settings import set_up_ray
 
-    os.environ.update({name: os.environ.get(name, value) for name, value in RAY_SETTINGS.items()})
+    set_up_ray()
     from pipelines.cluster import address
     from pipelines.ray_driver import ray_session
 

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 import torch
 
-from pipelines.document import Node, Place, choices, validate
+from pipelines.document import Node, Place, validate
 from pipelines.errors import InputError
 from pipelines.fingerprint import fingerprint
-from pipelines.plan import Item, items, study_card
+from pipelines.plan import Item, chosen, study_card
 from pipelines.policy import CONFIG, FILE, Actor, Saved, load, settings
 from pipelines.store import Home
 from pipelines.study import Study
@@ -113,24 +113,19 @@ def of_study(study: Study, home: Path, arms: Sequence[str] = (), seeds: Sequence
     Raises:
         InputError: there is no such arm, or no policy at all.
     """
-    faults = [f"--arm: '{arm}' is not allowed; {choices(arm, study.arms)}" for arm in arms if arm not in study.arms]
-    if faults:
-        raise InputError("\n".join(faults))
+    plan = chosen(study, fingerprint(), arms, seeds)
     from pipelines.mlflow_tracker import open_existing
 
     place = Home(home)
     tracker = open_existing(study_card(study), place)
     done = {(r.arm, r.key): r.ref for r in tracker.recorded() if r.status == "finished"} if tracker else {}
     found = False
-    for item in items(study, fingerprint(), ""):
-        card = item.card
-        if (arms and card.arm not in arms) or (seeds and card.seed not in seeds):
-            continue
-        ref = done.get((card.arm, item.key))
+    for item in plan:
+        ref = done.get((item.card.arm, item.key))
         saved = _kept(tracker, ref, item) if tracker and ref else _begun(place, item)
         if saved is not None:
             found = True
-            yield Policy(card.arm, saved)
+            yield Policy(item.card.arm, saved)
     if not found:
         raise InputError(f"{study.name} ({study.profile}): no such run has a policy yet; `rhmc study run` trains it")
 

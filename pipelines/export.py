@@ -5,10 +5,12 @@ The files are canonical: the same log gives the same bytes (sorted rows, no cloc
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from pipelines.errors import InputError
 from pipelines.fingerprint import fingerprint
 from pipelines.host import Host
 from pipelines.plan import Item, items, study_card
@@ -112,3 +114,25 @@ def write_parquet(path: Path, schema: pa.Schema, rows: list[tuple[object, ...]])
     table = pa.table([pa.array(column, field.type) for column, field in zip(columns, schema, strict=True)], schema)
     with whole(path, durable=True) as part:
         pq.write_table(table, part, compression="zstd", version="2.6", row_group_size=2**20)
+
+
+def read_parquet(path: Path, schema: pa.Schema, what: str) -> list[dict[str, Any]]:
+    """The rows of a table that `write_parquet` wrote; none without a file.
+
+    Args:
+        path: the file.
+        schema: its columns.
+        what: of which the table is, in words, for the error.
+
+    Raises:
+        InputError: another file has the name.
+    """
+    if not path.exists():
+        return []
+    try:
+        table = pq.read_table(path)
+    except (OSError, pa.ArrowException) as error:
+        raise InputError(f"{path}: not a readable table; move it away") from error
+    if table.schema.names != schema.names:
+        raise InputError(f"{path}: a table, but not one of {what}; move it away")
+    return table.to_pylist()

@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedSeq
 
+from pipelines.document import choices
+from pipelines.errors import InputError
 from pipelines.host import Host
 from pipelines.study import RunSpec, Study, changes
 from pipelines.tracker import Card, Recorded, StudyCard
@@ -49,6 +51,19 @@ def items(study: Study, fingerprint: str, commit: str, where: Host | None = None
         card = Card(run.arm, spec.seed, spec.id, fingerprint, algorithm, task, commit, params, host=where or Host())
         planned.append(Item(card, spec, study.name))
     return planned
+
+
+def chosen(study: Study, fingerprint: str, arms: Sequence[str] = (), seeds: Sequence[int] = ()) -> list[Item]:
+    """The planned runs of these arms and seeds, of all where none are named; for commands with `--arm` and `--seed`.
+
+    Raises:
+        InputError: there is no such arm.
+    """
+    faults = [f"--arm: '{arm}' is not allowed; {choices(arm, study.arms)}" for arm in arms if arm not in study.arms]
+    if faults:
+        raise InputError("\n".join(faults))
+    plan = items(study, fingerprint, "")
+    return [i for i in plan if (not arms or i.card.arm in arms) and (not seeds or i.card.seed in seeds)]
 
 
 def flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -17,8 +17,8 @@ from ray.tune.experiment import Trial
 from ray.tune.search import Searcher
 
 from pipelines.cluster import DEATHS, Deaths, Place, address, knock, outline, survey, travelling, watched
+from pipelines.ray_settings import RAY_SETTINGS
 from pipelines.recorder import Recorder
-from pipelines.run import RAY_SETTINGS
 from pipelines.store import StoreError, one_line
 from pipelines.trainable import RunTrainable
 

@@ -1,7 +1,6 @@
 """Launch a study: what its plan still lacks goes through Ray Tune, results go to the log as they come."""
 
 import json
-import os
 import shlex
 import shutil
 import signal
@@ -19,6 +18,7 @@ from pipelines.fingerprint import fingerprint
 from pipelines.host import host
 from pipelines.plan import Item, commit, finished, items, study_card
 from pipelines.progress import Board, board, print_table
+from pipelines.ray_settings import set_up_ray
 from pipelines.recorder import Recorder
 from pipelines.store import Home, StoreError, without_password
 from pipelines.study import Study
@@ -28,17 +28,6 @@ if TYPE_CHECKING:
     from pipelines.mlflow_tracker import MlflowTracker
 
 DONE, FAILED, BAD, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143  # exit codes
-
-RAY_SETTINGS = {
-    "RAY_USAGE_STATS_ENABLED": "0",
-    "RAY_CHDIR_TO_TRIAL_DIR": "0",
-    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
-    "RAY_AIR_NEW_OUTPUT": "0",
-    "RAY_DEDUP_LOGS": "0",
-    "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
-    "TUNE_DISABLE_SIGINT_HANDLER": "1",  # ours lets every run save itself first
-    "TUNE_WARN_EXCESSIVE_EXPERIMENT_CHECKPOINT_SYNC_THRESHOLD_S": "0",
-}
 
 
 def run_study(study: Study, home: Path) -> int:
@@ -191,11 +180,6 @@ def train(study: Study, recorder: Recorder, home: Home, interrupts: Interrupts) 
             fit(jobs, recorder, scratch, concurrent, cpus, stop)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
-
-
-def set_up_ray() -> None:
-    """Ray reads its settings when it is imported."""
-    os.environ.update({name: os.environ.get(name, value) for name, value in RAY_SETTINGS.items()})
 
 
 def animated(study: Study, plan: list[Item]) -> set[str]:

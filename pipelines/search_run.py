@@ -22,7 +22,8 @@ from pipelines.fingerprint import fingerprint
 from pipelines.found import file_name, slug, winner_yaml, write_text
 from pipelines.plan import commit
 from pipelines.progress import Board, board, print_table
-from pipelines.run import BAD, DONE, FAILED, Interrupts, guarded, set_up_ray
+from pipelines.ray_settings import set_up_ray
+from pipelines.run import BAD, DONE, FAILED, Interrupts, guarded
 from pipelines.search import Search
 from pipelines.store import Checkpoints, Home, StoreError, without_password
 from pipelines.tracker import Card, RunLog, Status, StudyCard, Tracker

@@ -7,10 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
-from pipelines.errors import InputError
-from pipelines.export import METRICS, RUNS, write_parquet
+from pipelines.export import METRICS, RUNS, read_parquet, write_parquet
 from pipelines.fingerprint import fingerprint
 from pipelines.plan import commit
 from rhmc.envs import EnvConfig
@@ -50,9 +48,13 @@ def export_yardsticks(env: EnvConfig, scores: Scores, episodes: int, seed: int, 
     values = [row for run, score in zip(runs, placed.values(), strict=True) for row in _values(run, score)]
     new = {_place(run) for run in runs}
     current = (fingerprint(), profile)
-    kept = [r for r in _read(runs_file, RUNS) if (r["fingerprint"], r["profile"]) == current and _place(r) not in new]
+    kept = [
+        r
+        for r in read_parquet(runs_file, RUNS, STUDY)
+        if (r["fingerprint"], r["profile"]) == current and _place(r) not in new
+    ]
     ids = {run["run"] for run in kept}
-    values += [row for row in _read(values_file, METRICS) if row["run"] in ids]
+    values += [row for row in read_parquet(values_file, METRICS, STUDY) if row["run"] in ids]
     write_parquet(values_file, METRICS, _rows(METRICS, values))
     write_parquet(runs_file, RUNS, _rows(RUNS, runs + kept))
     return values_file
@@ -88,18 +90,6 @@ def _values(run: Row, score: Mapping[str, float]) -> Iterable[Row]:
 def _place(run: Row) -> tuple[str, str]:
     """Policy and task: what a later score replaces."""
     return run["arm"], json.dumps(json.loads(run["config"])["env"], sort_keys=True)
-
-
-def _read(path: Path, schema: pa.Schema) -> list[Row]:
-    if not path.exists():
-        return []
-    try:
-        table = pq.read_table(path)
-    except (OSError, pa.ArrowException) as error:
-        raise InputError(f"{path}: not a readable table; move it away") from error
-    if table.schema.names != schema.names:
-        raise InputError(f"{path}: a table, but not one of yardsticks; move it away")
-    return table.to_pylist()
 
 
 def _rows(schema: pa.Schema, rows: Iterable[Row]) -> list[tuple[object, ...]]:

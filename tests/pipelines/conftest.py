@@ -51,7 +51,7 @@ def home(tmp_path: Path, template: Path) -> Path:
 @pytest.fixture(scope="session")
 def cluster() -> Iterator[None]:
     """Ray with two processors, shared by the tests of one process."""
-    from pipelines.run import RAY_SETTINGS
+    from pipelines.ray_settings import RAY_SETTINGS
 
     os.environ.update(RAY_SETTINGS)
     from pipelines.ray_driver import ray_session
