@@ -17,7 +17,7 @@ from ray.tune.experiment import Trial
 from ray.tune.search import Searcher
 
 from pipelines.cluster import DEATHS, Deaths, Place, address, knock, outline, survey, travelling, watched
-from pipelines.ray_settings import RAY_SETTINGS
+from pipelines.ray_settings import OWN_NODE, RAY_SETTINGS
 from pipelines.recorder import Recorder
 from pipelines.store import StoreError, one_line
 from pipelines.trainable import RunTrainable
@@ -90,7 +90,7 @@ def _joined(where: str) -> Iterator[None]:
 def _started(cpus: int, name: str) -> Iterator[None]:
     with sockets(name or str(os.getpid())) as folder:
         with _explained("on this machine"):
-            os.environ.setdefault("RAY_AUTH_MODE", "disabled")
+            os.environ.update({name: os.environ.get(name, value) for name, value in OWN_NODE.items()})
             ray.init(
                 address="local",
                 num_cpus=cpus,

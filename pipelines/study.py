@@ -93,7 +93,7 @@ class Resources(Frozen):
 
     concurrent: int = Field(2, ge=1, description="runs at a time")
     cpus: int = Field(1, ge=1, description="processors of a run")
-    checkpoint_every: int = Field(10, ge=1, description="points of the evaluation grid between checkpoints")
+    checkpoint_every: int = Field(20, ge=1, description="points of the evaluation grid between checkpoints")
     animate: Literal["first", "all", "none"] = Field("first", description="seeds whose runs keep an animated episode")
 
 

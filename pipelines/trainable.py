@@ -117,7 +117,8 @@ class RunTrainable(Trainable):
     def _save(self, trainer: Trainer | Seeds) -> None:
         state = self.state()
         if trainer.done:  # also where nothing is left to train: the file that a killed worker left may be damaged
-            kept = without_replay(state["trainer"]) | {SPEC: self.job["spec"]}
+            state["trainer"] = without_replay(state["trainer"])  # nothing more is learned from it
+            kept = state["trainer"] | {SPEC: self.job["spec"]}
             save_atomically(self.checkpoints.folder / FILE, kept)
             if self.job.get("animate"):
                 self._animate(kept)

@@ -224,6 +224,19 @@ def test_the_policy_is_the_last_state_with_empty_replays(start: Start, tmp_path:
     assert same(policy, without_replay(state) | {"spec": spec(0).canonical()})
 
 
+def test_the_last_checkpoint_has_no_replay_either_and_tells_everything_once_more(start: Start, tmp_path: Path) -> None:
+    run = start()
+    told = points(finish(run))
+    run.cleanup()
+    newest = Checkpoints(tmp_path / "a" / "run0").newest()
+    assert newest is not None
+    assert newest["trainer"]["algorithm"]["experience"]["replay"]["size"] == 0
+    policy = load_whole(tmp_path / "a" / "run0" / "policy.pt")
+    again = start("a").step()
+    assert (again["done"], again["stopped"], points([again])) == (True, False, told)
+    assert same(load_whole(tmp_path / "a" / "run0" / "policy.pt"), policy)
+
+
 def test_a_stop_saves_the_run_at_its_next_point(start: Start, tmp_path: Path) -> None:
     run = start(every=100)
     run.step()
