@@ -1,9 +1,10 @@
-"""Figures 4, 5 and 8: states of both tasks as they were played, and an instance of the regulator met on the way.
+"""Figures 4, 5 and 8: states of both tasks as they were played, and an instance of the regulator met on the way;
+beside them the smallest instances that Theorem 1 is false on.
 
 What an episode shows is decided by scripted policies and fixed seeds, so the same code draws the same pictures.
 """
 
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Generator, Tensor
@@ -11,6 +12,7 @@ from torch import Generator, Tensor
 from rhmc.envs import coverage, navigation
 from rhmc.regulation import Path, algorithm1_path, exact, optimal_path, paper
 from rhmc.scripted import SCRIPTED
+from rhmc.theorem import smallest_counterexample
 
 Record = dict[str, Any]
 
@@ -33,11 +35,12 @@ class Met(NamedTuple):
 
 
 def describe_scenes() -> Record:
-    """`navigation` (an episode), `coverage` (a state per number of sensors) and `regulation` (an instance)."""
+    """`navigation` (an episode), `coverage` (a state per number of sensors), `regulation` and `counterexamples`."""
     return {
         "navigation": _navigation(),
         "coverage": [_coverage(agents) for agents in SENSORS],
         "regulation": _regulation(),
+        "counterexamples": [_counterexample("reward"), _counterexample("count")],
     }
 
 
@@ -89,18 +92,30 @@ def _regulation() -> Record:
     index = min(lost, key=lambda k: _clarity(most, k))
     held = most.assignment[index]
     kept = _distinct(most, index)
-    options = _padded(kept)
-    paths = {"algorithm_1": algorithm1_path(options, held, ALPHA), "optimum": optimal_path(options, held, ALPHA)}
-    return {
-        "alpha": ALPHA,
+    return _instance(kept, held) | {
         "horizon": HORIZON,
-        "assignment": held.int().tolist(),
-        "options": [agent.int().tolist() for agent in kept],
-        "paths": {name: _path(path, kept) for name, path in paths.items()},
         "met": [
             {"horizon": horizon, "states": len(m.gap), "lost": int((m.gap > TOLERANCE).sum()), "max_gap": _gap(m)}
             for horizon, m in met.items()
         ],
+    }
+
+
+def _counterexample(by: Literal["reward", "count"]) -> Record:
+    """The smallest instance on which Algorithm 1 misses the largest reward, or even the largest count of targets."""
+    found = smallest_counterexample(ALPHA, by)
+    return {"by": by} | _instance(list(found.options), found.assignment)
+
+
+def _instance(kept: list[Tensor], held: Tensor) -> Record:
+    """What each agent's options complete, N times (D_i, M), who is assigned to what (N, M), and both paths."""
+    options = _padded(kept)
+    paths = {"algorithm_1": algorithm1_path(options, held, ALPHA), "optimum": optimal_path(options, held, ALPHA)}
+    return {
+        "alpha": ALPHA,
+        "assignment": held.int().tolist(),
+        "options": [agent.int().tolist() for agent in kept],
+        "paths": {name: _path(path, kept) for name, path in paths.items()},
     }
 
 

@@ -5,7 +5,7 @@ A part that is not there draws nothing; a part of another form is a fault of one
 
 import json
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
@@ -130,15 +130,26 @@ class Met(Part):
     max_gap: float
 
 
-class Regulation(Part):
+class Instance(Part):
     """An instance: assignment (N, M), what each agent's options complete (N, D_i, M), and both paths."""
 
     alpha: float
-    horizon: int
     assignment: tuple[tuple[int, ...], ...]
     options: tuple[tuple[tuple[int, ...], ...], ...]
     paths: Paths
+
+
+class Regulation(Instance):
+    """An instance met on the way, and how often Algorithm 1 fell short there."""
+
+    horizon: int
     met: tuple[Met, ...]
+
+
+class Counterexample(Instance):
+    """A smallest instance on which Algorithm 1 misses the largest reward, or the largest count of targets."""
+
+    by: Literal["reward", "count"]
 
 
 class Scenes(Part):
@@ -147,6 +158,7 @@ class Scenes(Part):
     navigation: Navigation
     coverage: tuple[Coverage, ...]
     regulation: Regulation
+    counterexamples: tuple[Counterexample, ...] = ()
 
 
 def read_modules(folder: Path, faults: list[str]) -> tuple[Build, ...]:

@@ -33,7 +33,7 @@ class Picture(NamedTuple):
 
 def gallery(results: Results, paper: Paper) -> list[Picture]:
     """The paper's figures in their order, then what goes beyond it. What has no data is left out."""
-    drawn = [*_networks(results), *_states(results), *_scaling(results)]
+    drawn = [*_networks(results), *_states(results), *_scaling(results), *_counterexamples(results)]
     known = {spec.study: name for name, spec in paper.figures.items()}
     for study in results.studies:
         spec = paper.figures[known[study]] if study in known else paper.curves_of(study, results.task(study))
@@ -190,6 +190,22 @@ def _states(results: Results) -> Iterator[Picture]:
     yield Picture(
         "fig_8", "Sensor coverage with different numbers of sensors", caption, alt, scenes.coverage(found.coverage)
     )
+
+
+def _counterexamples(results: Results) -> Iterator[Picture]:
+    found = results.scenes.counterexamples if results.scenes else ()
+    if not found:
+        return
+    rewards = [(number(case.paths.algorithm_1.reward, 2), number(case.paths.optimum.reward, 2)) for case in found]
+    caption = (
+        "Theorem 1 says that Algorithm 1 finds the largest reward. See where the orange way, which keeps the first of "
+        f"two sets of equal size, leaves the blue one: {joined([f'{a} instead of {b}' for a, b in rewards])}."
+    )
+    alt = "Graphs of options by agent with two paths: " + "; ".join(
+        f"Algorithm 1, reward {ours}, optimum {best}" for ours, best in rewards
+    )
+    title = "Theorem 1: the smallest counterexamples"
+    yield Picture("counterexamples", title, caption, f"{alt}.", scenes.counterexamples(found), "-", "rhmc drawings")
 
 
 def _scaling(results: Results) -> Iterator[Picture]:

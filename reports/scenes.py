@@ -1,4 +1,5 @@
-"""Figures 4, 5 and 8: an instance of the regulator as a graph, and states of both tasks as they were played."""
+"""Figures 4, 5 and 8: an instance of the regulator as a graph, and states of both tasks as they were played; Theorem
+1's smallest counterexamples, drawn as Figure 4 is."""
 
 from collections.abc import Sequence
 
@@ -8,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Wedge
 
 from reports.canvas import BLUE, FAINT, GREEN, INK, ORANGE, QUIET, Drawing, blank, foot, head, styled
-from reports.drawn import Coverage, Joint, Navigation, Regulation
+from reports.drawn import Counterexample, Coverage, Instance, Joint, Navigation, Regulation
 from reports.tables import joined, number
 
 AGENTS = (BLUE, ORANGE, GREEN, "#AA4499", "#B07C00", "#56A0D3")
@@ -16,26 +17,39 @@ AGENTS = (BLUE, ORANGE, GREEN, "#AA4499", "#B07C00", "#56A0D3")
 
 def regulation(found: Regulation) -> Drawing:
     """Figure 4: a column per agent, a node per option, the way of Algorithm 1 and a best one."""
-    n, most = len(found.options), max(map(len, found.options))
     with styled():
-        figure = blank(9.5, 2.2 + 0.95 * most)
+        figure = blank(9.5, 2.2 + 0.95 * max(map(len, found.options)))
         head(figure, "Regulation: Algorithm 1 and the optimum", _regulation_words(found))
-        axes = figure.add_axes((0.03, 0.08, 0.94, 0.8))
-        axes.set_axis_off()
-        axes.set_xlim(-0.45, n - 0.3)
-        axes.set_ylim(-most - 0.25, 1.0)
-        _options(axes, found)
-        paths = (("Algorithm 1", found.paths.algorithm_1, ORANGE, 0.05), ("optimum", found.paths.optimum, BLUE, -0.05))
-        for name, path, colour, shift in paths:
-            _way(axes, path, colour, shift)
-            row = -most + (0.3 if name == "optimum" else 0.0)
-            axes.text(-0.4, row, _path_words(name, path), color=colour, fontsize=9.5, fontweight="bold", va="center")
+        _graph(figure.add_axes((0.03, 0.08, 0.94, 0.8)), found)
         share = "; ".join(f"{m.lost} of {m.states:,} at horizon {m.horizon}" for m in found.met)
         foot(
             figure,
             f"Algorithm 1 below the optimum in states met by a scripted policy, pairs assigned by a coin: {share}.",
         )
     return Drawing(figure, _regulation_numbers(found))
+
+
+MISSED = {"reward": "largest reward missed", "count": "not even the most targets"}
+
+
+def counterexamples(found: Sequence[Counterexample]) -> Drawing:
+    """Side by side, each with a title that says what Algorithm 1 misses there."""
+    widths = [len(case.options) + 0.15 for case in found]
+    most = max(len(agent) for case in found for agent in case.options)
+    with styled():
+        figure = blank(9.5, 2.3 + 0.95 * most)
+        words = f"α = {found[0].alpha:g}; no instance with fewer agents x options x targets does it"
+        head(figure, "Theorem 1's smallest counterexamples", words)
+        left = 0.03
+        for case, width in zip(found, widths, strict=True):
+            share = 0.94 * width / sum(widths)
+            axes = figure.add_axes((left, 0.03, share - 0.02, 0.78))
+            _graph(axes, case)
+            size = f"{len(case.options)} agents, {len(case.assignment[0])} targets"
+            axes.set_title(f"{size}: {MISSED[case.by]}", fontsize=10, loc="left")
+            left += share
+    tables = [_regulation_numbers(case).assign(missed=case.by) for case in found]
+    return Drawing(figure, pd.concat(tables, ignore_index=True))
 
 
 def navigation(found: Navigation) -> Drawing:
@@ -85,7 +99,21 @@ def covered(state: Coverage) -> int:
     return int(np.asarray(state.seen).any(0).sum())
 
 
-def _options(axes: Axes, found: Regulation) -> None:
+def _graph(axes: Axes, found: Instance) -> None:
+    """A column per agent, both ways through it, and below what each of them completes."""
+    n, most = len(found.options), max(map(len, found.options))
+    axes.set_axis_off()
+    axes.set_xlim(-0.45, n - 0.3)
+    axes.set_ylim(-most - 0.25, 1.0)
+    _options(axes, found)
+    paths = (("Algorithm 1", found.paths.algorithm_1, ORANGE, 0.05), ("optimum", found.paths.optimum, BLUE, -0.05))
+    for name, path, colour, shift in paths:
+        _way(axes, path, colour, shift)
+        row = -most + (0.3 if name == "optimum" else 0.0)
+        axes.text(-0.4, row, _path_words(name, path), color=colour, fontsize=9.5, fontweight="bold", va="center")
+
+
+def _options(axes: Axes, found: Instance) -> None:
     """All nodes and all edges."""
     for i, agent in enumerate(found.options):
         held = [str(j + 1) for j, given in enumerate(found.assignment[i]) if given]
@@ -114,7 +142,7 @@ def _regulation_words(found: Regulation) -> str:
     return f"met in coverage: horizon {found.horizon} steps, α = {found.alpha:g}; options that differ, once each"
 
 
-def _regulation_numbers(found: Regulation) -> pd.DataFrame:
+def _regulation_numbers(found: Instance) -> pd.DataFrame:
     both = {"algorithm_1": found.paths.algorithm_1, "optimum": found.paths.optimum}
     rows = [
         {"agent": i + 1, "option": d + 1, "completes": " ".join(str(j + 1) for j, x in enumerate(mask) if x)}

@@ -108,6 +108,21 @@ def test_the_instance_is_solved_by_hand(scenes: Record) -> None:
         assert [any(mask[j] for mask in taken) for j in range(5)] == path["completed"]
 
 
+def test_the_counterexamples_refute_the_theorem_by_the_slow_oracle(scenes: Record) -> None:
+    """The first misses the largest reward with as many targets, the second completes fewer than it could."""
+    by_reward, by_count = scenes["counterexamples"]
+    assert (by_reward["by"], by_count["by"]) == ("reward", "count")
+    for found in (by_reward, by_count):
+        options = [[[bool(x) for x in mask] for mask in agent] for agent in found["options"]]
+        assignment = [[bool(x) for x in row] for row in found["assignment"]]
+        best, theirs = found["paths"]["optimum"], found["paths"]["algorithm_1"]
+        assert best["reward"] == pytest.approx(oracle.optimum(options, assignment, found["alpha"]), abs=1e-5)
+        assert theirs["reward"] == pytest.approx(oracle.algorithm1(options, assignment, found["alpha"]), abs=1e-5)
+        assert theirs["reward"] < best["reward"] - 0.1
+    counts = [[sum(case["paths"][name]["completed"]) for name in case["paths"]] for case in (by_reward, by_count)]
+    assert counts == [[1, 1], [1, 2]]
+
+
 def test_options_are_of_assigned_targets_and_differ(scenes: Record) -> None:
     found = scenes["regulation"]
     for held, agent in zip(found["assignment"], found["options"], strict=True):

@@ -184,6 +184,18 @@ SCENES: dict[str, Any] = {
         },
         "met": [{"horizon": 6, "states": 1000, "lost": 7, "max_gap": 1.1}],
     },
+    "counterexamples": [
+        {
+            "by": "reward",
+            "alpha": 0.1,
+            "assignment": [[1, 1], [0, 1]],
+            "options": [[[0, 1], [1, 0]], [[0, 0], [0, 0]]],
+            "paths": {
+                "algorithm_1": {"choices": [0, 0], "completed": [False, True], "reward": 0.4},
+                "optimum": {"choices": [1, 0], "completed": [True, False], "reward": 0.9},
+            },
+        },
+    ],
 }
 
 

@@ -68,6 +68,29 @@ def test_the_regulation_figure_states_both_rewards(states: Scenes) -> None:
     ]
 
 
+def test_the_counterexamples_state_what_is_missed(states: Scenes) -> None:
+    drawing = scenes.counterexamples(states.counterexamples)
+    text = words(drawing)
+    assert "2 agents, 2 targets: largest reward missed" in text
+    assert "Algorithm 1: completes 2, reward 0.40" in text
+    assert "optimum: completes 1, reward 0.90" in text
+    columns = ["missed", "agent", "option", "algorithm_1", "optimum", "optimum_reward"]
+    assert drawing.numbers[columns].to_numpy().tolist() == [
+        ["reward", 1, 1, 1, 0, 0.9],
+        ["reward", 1, 2, 0, 1, 0.9],
+        ["reward", 2, 1, 1, 1, 0.9],
+        ["reward", 2, 2, 0, 0, 0.9],
+    ]
+
+
+def test_a_file_without_counterexamples_draws_none(tmp_path: Path) -> None:
+    old = {name: part for name, part in factory.SCENES.items() if name != "counterexamples"}
+    (tmp_path / "scenes.json").write_text(json.dumps(old))
+    found = read_scenes(tmp_path, [])
+    assert found is not None
+    assert found.counterexamples == ()
+
+
 def test_the_tasks_are_drawn_from_their_states(states: Scenes) -> None:
     coverage = scenes.coverage(states.coverage)
     assert {"2 sensors: 1 of 2 targets seen", "3 sensors: 1 of 2 targets seen"} <= set(words(coverage))
