@@ -19,7 +19,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from statistics import median
@@ -53,7 +53,7 @@ PARTS = {  # label -> where it is done, and what it grows with
     "build": ("worker", "runs"),
     "end of training": ("worker", "runs"),
     "animation": ("worker", "arms"),
-    "checkpoint": ("worker", "points / 10"),
+    "checkpoint": ("worker", "points / 20"),
     "log a point": ("driver", "points"),
     "Tune": ("driver", "points"),
     "evaluation": ("worker, part of training", "points"),
@@ -324,6 +324,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=10.0, help="of training, all runs together (default: 10)")
     parser.add_argument("--repeats", type=int, default=1, help="launches of each side (default: 1)")
+    parser.add_argument(
+        "--together", action="store_true", help="both sides at once: whether training itself costs more"
+    )
     parser.add_argument("--side", choices=("bare", "platform"), help=argparse.SUPPRESS)
     parser.add_argument("--out", type=Path, help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -331,6 +334,9 @@ def main() -> None:
         {"bare": bare, "platform": platform}[args.side](changes(args.minutes), args.out)
         return
     print(f"{env_speed.machine()} {os.cpu_count()} cores.\n\n`rhmc {shlex.join(command(changes(args.minutes)))}`\n")
+    if args.together:
+        print(together(args.minutes))
+        return
     print(f"| {' | '.join(HEAD)} |\n|---{'|---:' * (len(HEAD) - 1)}|", flush=True)
     accounts: dict[str, list[Account]] = {"platform": [], "bare": []}
     with suppress(KeyboardInterrupt):  # what there is by then is shown
@@ -341,6 +347,20 @@ def main() -> None:
                 print(line(f"{side} {i + 1}", several[-1]), flush=True)
     if accounts["platform"]:
         print(f"\n{parts(accounts['platform'])}\n\n{verdict(accounts)}")
+
+
+def together(minutes: float) -> str:
+    """Both sides at once, so that the machine's slow minutes are those of both: seconds of training alone."""
+
+    def account(side: str) -> Account:
+        with tempfile.TemporaryDirectory() as folder:
+            return Account(launch(side, minutes, Path(folder)))
+
+    os.environ.update({"RAY_worker_niceness": "0"})  # else the other side would go first
+    with ThreadPoolExecutor(2) as pool:
+        ours, loop = pool.map(account, ("platform", "bare"))
+    spent = f"platform {ours.training_cpu:.1f} CPU s, bare {loop.training_cpu:.1f} CPU s"
+    return f"Training alone, both sides at once: {spent}, {ours.training_cpu / loop.training_cpu - 1:+.1%}."
 
 
 def verdict(accounts: dict[str, list[Account]]) -> str:

@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self
 
@@ -174,6 +175,25 @@ class LiveBoard:
     def say(self, text: str) -> None:
         """See `Board`."""
         self.progress.console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+class StopFile:
+    """The file that asks every run to save itself and end. Whoever finds it first says so on the board.
+
+    The handler of a signal makes it and must not print itself: it may have come in the middle of a print, which Python
+    answers with an error in whatever was printing.
+    """
+
+    def __init__(self, path: Path, display: Board) -> None:
+        self.path, self.board, self.told = path, display, False
+
+    def exists(self) -> bool:
+        """Whether it is there."""
+        there = self.path.exists()
+        if there and not self.told:
+            self.told = True
+            self.board.say("interrupted: each run stops at its next point and saves itself; again to leave at once")
+        return there
 
 
 def board(console: Console) -> Board:

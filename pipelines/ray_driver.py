@@ -17,6 +17,7 @@ from ray.tune.experiment import Trial
 from ray.tune.search import Searcher
 
 from pipelines.cluster import DEATHS, Deaths, Place, address, knock, outline, survey, travelling, watched
+from pipelines.progress import StopFile
 from pipelines.ray_settings import OWN_NODE, RAY_SETTINGS
 from pipelines.recorder import Recorder
 from pipelines.store import StoreError, one_line
@@ -175,7 +176,7 @@ class Bridge(tune.Callback):
     """Hands Ray's events to the recorder. Tune must not see the recorder's errors: it would swallow or repeat them."""
 
     def __init__(self, recorder: Recorder, stop: Path) -> None:
-        self.recorder, self.stop = recorder, stop
+        self.recorder, self.stop = recorder, StopFile(stop, recorder.board)
         self.error: StoreError | None = None
         self.live: set[str] = set()
         self.places: dict[str, Place] = {}  # key -> where its worker is, once it has told

@@ -17,7 +17,7 @@ from rich.console import Console
 from pipelines.fingerprint import fingerprint
 from pipelines.host import host
 from pipelines.plan import Item, commit, finished, items, study_card
-from pipelines.progress import Board, board, print_table
+from pipelines.progress import board, print_table
 from pipelines.ray_settings import set_up_ray
 from pipelines.recorder import Recorder
 from pipelines.store import Home, StoreError, without_password
@@ -82,7 +82,6 @@ class Interrupts:
     def __init__(self) -> None:
         self.code, self.came = INTERRUPTED, False
         self.stop: Path | None = None  # the file that asks
-        self.board: Board | None = None
 
     def __enter__(self) -> Self:
         self.before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -98,10 +97,10 @@ class Interrupts:
             signal.signal(number, handler)
 
     @contextmanager
-    def go_to(self, stop: Path, board: Board) -> Iterator[None]:
-        """While runs train that look for the file `stop`."""
+    def go_to(self, stop: Path) -> Iterator[None]:
+        """While runs train that look for the file `stop`; who waits for them looks with a `StopFile`."""
         self._listen()  # again: Ray, which has just started, takes SIGTERM for itself
-        self.stop, self.board = stop, board
+        self.stop = stop
         try:
             yield
         finally:
@@ -109,13 +108,12 @@ class Interrupts:
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         self.code, self.came = 128 + number, True
-        if self.stop is None or self.board is None or self.stop.exists():
+        if self.stop is None or self.stop.exists():
             raise KeyboardInterrupt
         try:
             self.stop.touch()
         except OSError as error:  # a full disk
             raise KeyboardInterrupt from error
-        self.board.say("interrupted: each run stops at its next point and saves itself; again to leave at once")
 
 
 def _launch(study: Study, home: Home, interrupts: Interrupts) -> int:
@@ -174,7 +172,7 @@ def train(study: Study, recorder: Recorder, home: Home, interrupts: Interrupts) 
     concurrent, cpus = study.resources.concurrent, study.resources.cpus
     session = ray_session(concurrent, cpus, home.name(study.name, study.profile), home.root)
     try:
-        with session as remarks, interrupts.go_to(stop, recorder.board):
+        with session as remarks, interrupts.go_to(stop):
             for remark in remarks:
                 recorder.board.say(remark)
             fit(jobs, recorder, scratch, concurrent, cpus, stop)

@@ -21,7 +21,7 @@ from ruamel.yaml import YAML
 from pipelines.fingerprint import fingerprint
 from pipelines.found import file_name, slug, winner_yaml, write_text
 from pipelines.plan import commit
-from pipelines.progress import Board, board, print_table
+from pipelines.progress import Board, StopFile, board, print_table
 from pipelines.ray_settings import set_up_ray
 from pipelines.run import BAD, DONE, FAILED, Interrupts, guarded
 from pipelines.search import Search
@@ -121,7 +121,7 @@ def _train(search: Search, ledgers: Sequence[Ledger], book: "Book", home: Home, 
     name = home.name(search.name, search.profile)
     session = ray_session(resources.concurrent, resources.cpus, name, home.root)
     try:
-        with session as remarks, interrupts.go_to(stop, book.board):
+        with session as remarks, interrupts.go_to(stop):
             for remark in remarks:
                 book.board.say(remark)
             Drive(search, ledgers, Pool(resources.concurrent, resources.cpus), book, home, stop).run()
@@ -155,7 +155,7 @@ class Drive:
         self, search: Search, ledgers: Sequence[Ledger], pool: Workers, book: "Book", home: Home, stop: Path
     ) -> None:
         self.search, self.ledgers, self.pool, self.book = search, ledgers, pool, book
-        self.home, self.stop = home, stop
+        self.home, self.stop = home, StopFile(stop, book.board)
         self.running: dict[str, Running] = {}
 
     def run(self) -> None:
@@ -168,7 +168,7 @@ class Drive:
 
     def _fill(self) -> None:
         """Keep every worker busy; the arm that has most left to try goes first, so that all advance together."""
-        while self.pool.free and not self.stop.exists():
+        while not self.stop.exists() and self.pool.free:
             ledger = max(self.ledgers, key=lambda one: one.left)
             if not ledger.left:
                 return
@@ -187,7 +187,7 @@ class Drive:
                 "seeds": self.search.seed_list(),
                 "folder": str(folder),
                 "checkpoint_every": self.search.resources.checkpoint_every,
-                "stop": str(self.stop),
+                "stop": str(self.stop.path),
             }
         )
 

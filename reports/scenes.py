@@ -43,7 +43,7 @@ def counterexamples(found: Sequence[Counterexample]) -> Drawing:
         left = 0.03
         for case, width in zip(found, widths, strict=True):
             share = 0.94 * width / sum(widths)
-            axes = figure.add_axes((left, 0.03, share - 0.02, 0.78))
+            axes = figure.add_axes((left, 0.03, share - 0.02, 0.75))
             _graph(axes, case)
             size = f"{len(case.options)} agents, {len(case.assignment[0])} targets"
             axes.set_title(f"{size}: {MISSED[case.by]}", fontsize=10, loc="left")

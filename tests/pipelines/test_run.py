@@ -1,11 +1,15 @@
 """From a plan to a log: the recorder with the twin and no Ray, then the whole chain."""
 
+import fcntl
 import io
 import json
 import os
 import signal
+import subprocess
 import sys
+import termios
 import threading
+import time
 from collections.abc import Callable
 from contextlib import nullcontext
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -432,11 +436,11 @@ def test_rays_own_answer_to_sigterm_ends_the_launch(tmp_path: Path, monkeypatch:
     assert run_study(tiny(), tmp_path) == 143
 
 
-def test_the_first_signal_in_training_asks_and_the_second_ends(launch: Launch, tmp_path: Path) -> None:
-    stop, recorder = tmp_path / "stop", launch()
+def test_the_first_signal_in_training_asks_and_the_second_ends(tmp_path: Path) -> None:
+    stop = tmp_path / "stop"
     with Interrupts() as interrupts:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)  # as Ray does when it starts
-        with interrupts.go_to(stop, recorder.board):
+        with interrupts.go_to(stop):
             assert not interrupts.came
             signal.raise_signal(signal.SIGTERM)
             assert (interrupts.came, interrupts.code, stop.exists()) == (True, 143, True)
@@ -445,14 +449,50 @@ def test_the_first_signal_in_training_asks_and_the_second_ends(launch: Launch, t
     assert interrupts.code == 130
 
 
-def test_a_signal_on_a_full_disk_ends_the_launch(launch: Launch, tmp_path: Path) -> None:
-    recorder = launch()
+def test_a_signal_on_a_full_disk_ends_the_launch(tmp_path: Path) -> None:
     with (
         Interrupts() as interrupts,
-        interrupts.go_to(tmp_path / "none" / "stop", recorder.board),
+        interrupts.go_to(tmp_path / "none" / "stop"),
         pytest.raises(KeyboardInterrupt),
     ):
         signal.raise_signal(signal.SIGINT)
+
+
+PRINTS = """
+import sys
+from pathlib import Path
+from rich.console import Console
+from pipelines.progress import PlainBoard, StopFile
+from pipelines.run import Interrupts
+board, path = PlainBoard(Console()), Path(sys.argv[1])
+with Interrupts() as interrupts, interrupts.go_to(path):
+    stop = StopFile(path, board)
+    for k in range(2000):
+        board.say(f"{k:100}")
+        stop.exists()
+print(interrupts.code)
+"""
+
+
+def test_a_signal_in_the_middle_of_a_print_disturbs_no_line(tmp_path: Path) -> None:
+    """Nobody reads, so the pipe is full and the signal comes while a line is being written."""
+    command = [sys.executable, "-c", PRINTS, str(tmp_path / "stop")]
+    quiet = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    process = subprocess.Popen(command, cwd=Path(__file__).parents[2], env=quiet, text=True, **pipes)
+    assert process.stdout is not None
+    held = [-1, 0]
+    while held[-1] != held[-2] or not held[-1]:  # until the pipe fills no further
+        assert process.poll() is None, process.stdout.read()
+        time.sleep(0.5)
+        held.append(int.from_bytes(fcntl.ioctl(process.stdout, termios.FIONREAD, bytes(4)), sys.byteorder))
+    process.send_signal(signal.SIGTERM)
+    while not (tmp_path / "stop").exists():
+        time.sleep(0.01)
+    lines = process.communicate(timeout=60)[0].splitlines()
+    said = [line for line in lines if "interrupted" in line]
+    assert said == ["interrupted: each run stops at its next point and saves itself; again to leave at once"]
+    assert [line for line in lines if line not in said] == [*(f"{k:100}" for k in range(2000)), "143"]
 
 
 def test_the_folder_of_a_killed_driver_is_used_again() -> None:
