@@ -440,7 +440,7 @@ def _point_faults(results: Results) -> Iterator[str]:
     found = studied.drop_duplicates(keys)
     for row in found.itertuples():
         if (row.study, row.arm, int(str(row.seed)), row.run) not in planned:
-            arms = ", ".join(results.arms(str(row.study))) or "none"
+            arms = ", ".join(f"'{arm}'" for arm in results.arms(str(row.study))) or "none"
             yield f"{_name(row)}, run {row.run}: has points, and is not in the plan (planned arms: {arms})"
     counts = points.dropna(subset=["value"]).groupby(["run", "step", "metric"])["value"].nunique().reset_index()
     differing = counts[counts["value"] > 1].drop_duplicates("run")

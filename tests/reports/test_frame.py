@@ -112,7 +112,7 @@ def test_a_renamed_arm(tmp_path: Path) -> None:
     lines = faults(tmp_path, renamed(*study("ablation", ARMS)))
     assert len(lines) == 3  # one a seed
     assert "arm 'Full', seed 0" in lines[0]
-    assert "not in the plan (planned arms: full, no filter)" in lines[0]
+    assert "not in the plan (planned arms: 'full', 'no filter')" in lines[0]
 
 
 def test_two_seeds_with_one_id(tmp_path: Path) -> None:
