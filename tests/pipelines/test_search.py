@@ -553,6 +553,16 @@ def test_a_kill_at_any_write_changes_nothing(tmp_path: Path, pruner: str) -> Non
     assert kills > 25
 
 
+def test_what_a_launch_left_open_is_counted_once(tmp_path: Path) -> None:
+    world = World(load(), tmp_path)
+    left = world.ledgers()[0]
+    asked = [left.ask() for _ in range(3)]
+    assert asked[0] is not None
+    left.complete(asked[0], [1.0, 2.0])
+    assert world.ledgers()[0].take_up() == 2
+    assert [ledger.take_up() for ledger in world.ledgers()] == [0, 0]
+
+
 def test_a_stopped_search_saves_itself_and_continues(tmp_path: Path) -> None:
     class Stopping(Twin):
         def next(self, timeout: float) -> dict[str, Any]:

@@ -97,6 +97,8 @@ def test_charts_are_grouped_by_arm_and_show_the_headlines_first() -> None:
     for view in (curves, finals):
         assert view.state["groupBy"]["groupByKeys"] == [{"mode": "tag", "groupByData": "legend"}]
     assert every.state["groupBy"] is None
+    for view in (curves, finals, every):  # the best run first
+        assert (view.state["orderByKey"], view.state["orderByAsc"]) == ("metrics.`final/return`", False)
     charts = [chart for chart in curves.state["compareRunCharts"] if chart["type"] == "LINE"]
     assert all((chart["lineSmoothness"], chart["useGlobalLineSmoothing"]) == (0, False) for chart in charts)
     assert [chart["metricKey"] for chart in charts] == [
