@@ -1,7 +1,8 @@
 """Runs of a study as a folder or an archive that another machine takes in, so that the study goes on there.
 
 A bundle holds `bundle.json` (what it is), `runs.parquet` (a row per run), `points.parquet` (a row per run, step and
-metric, `time/` included), `policies/<key>.pt` of finished runs and `checkpoints/<key>/` of those under way.
+metric, `time/` included), `policies/<key>.pt` of finished runs and `checkpoints/<key>/` of those under way. One of
+values only has no policies and no runs under way.
 """
 
 import hashlib
@@ -91,13 +92,14 @@ class Entry(NamedTuple):
 # Packing
 
 
-def pack(study: Study, out: Path, home: Path) -> Packed:
+def pack(study: Study, out: Path, home: Path, *, values_only: bool = False) -> Packed:
     """Write the runs of the present plan and code that are finished or under way.
 
     Args:
         study: the plan.
         out: a folder, or an archive if its name ends with `.zip`; there must be nothing yet.
         home: the work folder.
+        values_only: leave policies and checkpoints behind.
 
     Raises:
         StoreError: nothing to pack, something is in the way, or the disk is full. Nothing is left behind then.
@@ -112,7 +114,7 @@ def pack(study: Study, out: Path, home: Path) -> Packed:
     with TemporaryDirectory() as name:
         folder = Path(name)
         try:
-            packed = _fill(folder, plan, tracker, place)
+            packed = _fill(folder, plan, tracker, place, values_only)
             if packed.finished + packed.begun == 0:
                 raise StoreError(f"{study.name} ({study.profile}): no run is finished or under way; nothing to export")
             about = Manifest(format=FORMAT, fingerprint=fingerprint(), commit=commit(), **card._asdict())
@@ -123,7 +125,7 @@ def pack(study: Study, out: Path, home: Path) -> Packed:
     return packed
 
 
-def _fill(folder: Path, plan: list[Item], tracker: Tracker | None, home: Home) -> Packed:
+def _fill(folder: Path, plan: list[Item], tracker: Tracker | None, home: Home, values_only: bool) -> Packed:
     recorded = {(run.arm, run.key): run for run in tracker.recorded()} if tracker else {}
     done = finished(recorded.values())
     runs: list[tuple[Any, ...]] = []
@@ -134,8 +136,8 @@ def _fill(folder: Path, plan: list[Item], tracker: Tracker | None, home: Home) -
         if tracker and place in done:
             ref = recorded[place].ref
             points += [(len(runs), row.step, row.metric, row.value) for row in tracker.rows([ref])]
-            digest = _policy(tracker, ref, folder / "policies" / f"{item.key}.pt")
-        elif not _checkpoints(home.checkpoints(item.key), folder / "checkpoints" / item.key):
+            digest = "" if values_only else _policy(tracker, ref, folder / "policies" / f"{item.key}.pt")
+        elif values_only or not _checkpoints(home.checkpoints(item.key), folder / "checkpoints" / item.key):
             continue
         made = recorded[place].commit if place in recorded else ""
         texts = json.dumps(item.card.params), item.spec.canonical()

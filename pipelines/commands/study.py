@@ -88,6 +88,9 @@ def export_runs(
     profile: Profile = "quick",
     variant: Variant = None,
     overrides: Sets = None,
+    values_only: Annotated[
+        bool, typer.Option("--values-only", help="Leave policies and checkpoints behind: small enough for git.")
+    ] = False,
 ) -> None:
     """Pack a study's finished runs, and the checkpoints of those under way, for another machine."""
     study = load_study(file, profile, overrides, variant)
@@ -95,7 +98,7 @@ def export_runs(
     from pipelines.store import StoreError, work_folder
 
     try:
-        packed = pack(study, out, work_folder())
+        packed = pack(study, out, work_folder(), values_only=values_only)
     except StoreError as error:
         raise InputError(str(error)) from error
     say(f"{out}: {packed.finished} of {packed.planned} runs finished, {packed.begun} under way")

@@ -92,6 +92,19 @@ def test_there_is_what_was_here(here: Path, there: Path, tmp_path: Path, name: s
     assert Checkpoints(Home(there).checkpoints(late.key)).newest() == {"a": 1}
 
 
+def test_values_travel_without_policies_and_count_as_finished(here: Path, there: Path, tmp_path: Path) -> None:
+    out = tmp_path / "bundle"
+    assert pack(STUDY, out, here, values_only=True) == Packed(planned=4, finished=2, begun=0)
+    assert sorted(file.name for file in out.rglob("*")) == ["bundle.json", "points.parquet", "runs.parquet"]
+    assert unpack(out, there)[2:5] == (2, 0, 0)
+    tracker = open_existing(study_card(STUDY), Home(there))
+    assert tracker is not None
+    ends = [row.value for run in tracker.recorded() for row in tracker.rows([run.ref]) if row.metric == "final/return"]
+    assert ends == [2.5, 2.5]
+    assert {run.status for run in tracker.recorded()} == {"finished"}
+    assert tracker.file(tracker.recorded()[0].ref, "policy.pt", tmp_path) is None
+
+
 def test_a_second_import_adds_nothing_and_keeps_what_got_further(here: Path, there: Path, tmp_path: Path) -> None:
     pack(STUDY, tmp_path / "b", here)
     unpack(tmp_path / "b", there)
