@@ -31,7 +31,7 @@ import psutil
 import rhmc.evaluate
 import rhmc.trainer
 from pipelines.ray_settings import set_up_ray
-from pipelines.study import RunSpec, Study
+from pipelines.study import Resources, RunSpec, Study
 from pipelines.trainable import RunTrainable
 
 ROOT = Path(__file__).parents[1]
@@ -53,7 +53,7 @@ PARTS = {  # label -> where it is done, and what it grows with
     "build": ("worker", "runs"),
     "end of training": ("worker", "runs"),
     "animation": ("worker", "arms"),
-    "checkpoint": ("worker", "points / 20"),
+    "checkpoint": ("worker", f"points / {Resources().checkpoint_every}"),
     "log a point": ("driver", "points"),
     "Tune": ("driver", "points"),
     "evaluation": ("worker, part of training", "points"),

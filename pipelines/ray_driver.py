@@ -18,7 +18,7 @@ from ray.tune.search import Searcher
 
 from pipelines.cluster import DEATHS, Deaths, Place, address, knock, outline, survey, travelling, watched
 from pipelines.progress import StopFile
-from pipelines.ray_settings import OWN_NODE, RAY_SETTINGS
+from pipelines.ray_settings import OWN_NODE, RAY_SETTINGS, set_up_ray
 from pipelines.recorder import Recorder
 from pipelines.store import StoreError, one_line
 from pipelines.trainable import RunTrainable
@@ -91,7 +91,7 @@ def _joined(where: str) -> Iterator[None]:
 def _started(cpus: int, name: str) -> Iterator[None]:
     with sockets(name or str(os.getpid())) as folder:
         with _explained("on this machine"):
-            os.environ.update({name: os.environ.get(name, value) for name, value in OWN_NODE.items()})
+            set_up_ray(OWN_NODE)
             ray.init(
                 address="local",
                 num_cpus=cpus,

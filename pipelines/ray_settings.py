@@ -1,6 +1,7 @@
 """Ray's settings for studies, searches and workers. Ray reads them when it is imported, so nothing here imports it."""
 
 import os
+from collections.abc import Mapping
 
 RAY_SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",
@@ -24,6 +25,6 @@ OWN_NODE = {  # of a node that is started for one launch: Ray's defaults suit ma
 }
 
 
-def set_up_ray() -> None:
-    """Put the settings into the environment; what a person has set there stays."""
-    os.environ.update({name: os.environ.get(name, value) for name, value in RAY_SETTINGS.items()})
+def set_up_ray(settings: Mapping[str, str] = RAY_SETTINGS) -> None:
+    """Put settings into the environment; what a person has set there stays."""
+    os.environ.update({name: os.environ.get(name, value) for name, value in settings.items()})

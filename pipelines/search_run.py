@@ -168,7 +168,7 @@ class Drive:
 
     def _fill(self) -> None:
         """Keep every worker busy; the arm that has most left to try goes first, so that all advance together."""
-        while not self.stop.exists() and self.pool.free:
+        while not self.stop.exists() and self.pool.free:  # looked for first: it is announced while all are busy too
             ledger = max(self.ledgers, key=lambda one: one.left)
             if not ledger.left:
                 return
