@@ -19,7 +19,7 @@ from ray.tune.search import Searcher
 from pipelines.cluster import DEATHS, Deaths, Place, address, knock, outline, survey, travelling, watched
 from pipelines.progress import StopFile
 from pipelines.ray_settings import OWN_NODE, RAY_SETTINGS, set_up_ray
-from pipelines.recorder import Recorder
+from pipelines.recorders import Recorders
 from pipelines.store import StoreError, one_line
 from pipelines.trainable import RunTrainable
 
@@ -114,7 +114,7 @@ def _explained(where: str) -> Iterator[None]:
         raise StoreError(f"Ray cannot be used, {where}: {one_line(error)}") from error
 
 
-def fit(jobs: list[dict[str, Any]], recorder: Recorder, scratch: Path, concurrent: int, cpus: int, stop: Path) -> None:
+def fit(jobs: list[dict[str, Any]], recorder: Recorders, scratch: Path, concurrent: int, cpus: int, stop: Path) -> None:
     """Run the jobs, `concurrent` at a time with `cpus` each.
 
     Raises:
@@ -175,7 +175,7 @@ class Queue(Searcher):
 class Bridge(tune.Callback):
     """Hands Ray's events to the recorder. Tune must not see the recorder's errors: it would swallow or repeat them."""
 
-    def __init__(self, recorder: Recorder, stop: Path) -> None:
+    def __init__(self, recorder: Recorders, stop: Path) -> None:
         self.recorder, self.stop = recorder, StopFile(stop, recorder.board)
         self.error: StoreError | None = None
         self.live: set[str] = set()

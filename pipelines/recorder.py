@@ -66,24 +66,24 @@ class Recorder:
         """Planned runs that are not finished."""
         return sum(len(items) for items in self.waiting.values())
 
-    def reuse(self) -> bool:
-        """Copy what was finished already, for another arm or in another study, instead of training it again.
+    @property
+    def status(self) -> Status:
+        """How the study stands when the launch ends."""
+        return "failed" if self.failures else "interrupted" if self.left else "finished"
 
-        Returns:
-            Whether anything is left to train.
-        """
+    def reuse(self) -> None:
+        """Copy what was finished already, for another arm or in another study, instead of training it again."""
         if not self.waiting:
-            return False
+            return
         there = self.tracker.finished_anywhere(self.plan[0].card.fingerprint)
         for key in [key for key in self.waiting if key in there]:
-            self._copy(there[key], self.waiting.pop(key))
+            self.adopt(key, there[key])
             Checkpoints(self.home.checkpoints(key)).clear_unused()
-        return bool(self.todo())
 
-    def again(self) -> bool:
-        """Whether to train once more: what other processes were training may be free by now, or finished."""
-        busy, self.busy = self.busy, False
-        return busy and self.reuse()
+    def adopt(self, key: str, source: str) -> None:
+        """Copy a finished run of another study, if this one waits for the training."""
+        if waiting := self.waiting.pop(key, None):
+            self._copy(source, waiting)
 
     def _copy(self, source: str, items: list[Item]) -> None:
         points = points_of(self.tracker.rows([source])) if items else []

@@ -1,4 +1,4 @@
-"""Launch a study: what its plan still lacks goes through Ray Tune, results go to the log as they come."""
+"""Launch studies: what their plans still lack goes through Ray Tune, results go to the log as they come."""
 
 import json
 import shlex
@@ -6,23 +6,25 @@ import shutil
 import signal
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, NamedTuple, Self
 
 from rich.console import Console
 
+from pipelines.errors import InputError
 from pipelines.fingerprint import fingerprint
 from pipelines.host import host
 from pipelines.plan import Item, commit, finished, items, study_card
-from pipelines.progress import board, print_table
+from pipelines.progress import Board, board, print_table
 from pipelines.ray_settings import set_up_ray
 from pipelines.recorder import Recorder
+from pipelines.recorders import Recorders
 from pipelines.store import Home, StoreError, without_password
 from pipelines.study import Study
-from pipelines.tracker import Status, Tracker
+from pipelines.tracker import Tracker
 
 if TYPE_CHECKING:
     from pipelines.mlflow_tracker import MlflowTracker
@@ -30,35 +32,60 @@ if TYPE_CHECKING:
 DONE, FAILED, BAD, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143  # exit codes
 
 
-def run_study(study: Study, home: Path) -> int:
-    """Bring a study to its end: skip what is finished, continue what was interrupted, train the rest.
+def run_studies(studies: Sequence[Study], home: Path) -> int:
+    """Bring studies to their end: skip what is finished, continue what was interrupted, train the rest.
+
+    Their runs are one queue, in the order of the studies: no worker is idle while the last run of a study trains, and
+    what several of them ask for is trained once.
 
     Args:
-        study: the plan.
+        studies: the plans, one or more.
         home: the work folder.
 
     Returns:
         0 all finished, 1 some run failed, 2 something is in the way, 130 interrupted, 143 terminated. A second launch
         is always safe.
+
+    Raises:
+        InputError: the studies cannot be launched together.
     """
-    return guarded(home, study.name, study.profile, lambda place, interrupts: _launch(study, place, interrupts))
+    if faults := list(_apart(studies)):
+        raise InputError("\n".join(faults))
+    names = [(study.name, study.profile) for study in studies]
+    return guarded(home, names, lambda place, interrupts: _launch(studies, place, interrupts))
 
 
-def guarded(home: Path, name: str, profile: str, launch: Callable[[Home, "Interrupts"], int]) -> int:
-    """Hold a study or a search while it is launched; what is in the way becomes one line and an exit code.
+def _apart(studies: Sequence[Study]) -> Iterator[str]:
+    """Why studies cannot be launched together."""
+    first = studies[0]
+    for name, count in Counter(study.name for study in studies).items():
+        if count > 1:
+            yield f"{name}: given {count} times; studies that run together need names of their own"
+    for study in studies:
+        for field, value in study.resources.model_dump().items():
+            other = getattr(first.resources, field)
+            if value != other:
+                yield (
+                    f"resources.{field} is {value} in {study.name} and {other} in {first.name}; studies that run "
+                    f"together share their workers: make them equal, or run them one after the other"
+                )
+
+
+def guarded(home: Path, names: Sequence[tuple[str, str]], launch: Callable[[Home, "Interrupts"], int]) -> int:
+    """Hold studies or a search while they are launched; what is in the way becomes one line and an exit code.
 
     Args:
         home: the work folder.
-        name: of the study or search.
-        profile: its profile.
+        names: of the studies or the search, each with its profile.
         launch: the work; gives the exit code.
     """
     place, interrupts = Home(home), Interrupts()
     try:
-        with interrupts:
+        with interrupts, ExitStack() as held:
             place.prepare()
-            with place.lock(name, profile):
-                return launch(place, interrupts)
+            for name, profile in sorted(names):  # in one order everywhere
+                held.enter_context(place.lock(name, profile))
+            return launch(place, interrupts)
     except StoreError as error:
         print(f"rhmc: {error}", file=sys.stderr)
         return BAD
@@ -116,35 +143,51 @@ class Interrupts:
             raise KeyboardInterrupt from error
 
 
-def _launch(study: Study, home: Home, interrupts: Interrupts) -> int:
+class Launched(NamedTuple):
+    """A study with its log and what keeps that in step."""
+
+    study: Study
+    tracker: "MlflowTracker"
+    recorder: Recorder
+
+
+def _launch(studies: Sequence[Study], home: Home, interrupts: Interrupts) -> int:
+    with board(Console()) as display, ExitStack() as logs:
+        launched = [logs.enter_context(_logged(study, home, display)) for study in studies]
+        recorders = Recorders([one.recorder for one in launched])
+        if skipped := sum(one.skipped for one in recorders.each):
+            display.say(f"{skipped} of {sum(len(one.plan) for one in recorders.each)} runs were finished before")
+        left = recorders.reuse()
+        while left and not interrupts.came:
+            train(studies, recorders, home, interrupts)
+            left = recorders.again()
+        for one in launched:
+            one.recorder.overview.publish()
+    _summary(launched)
+    found = {one.recorder.status for one in launched}
+    return FAILED if "failed" in found else interrupts.code if "interrupted" in found else DONE
+
+
+@contextmanager
+def _logged(study: Study, home: Home, display: Board) -> Iterator[Launched]:
+    """A study's log while it is written to; whatever happens, it ends with how far the study came."""
     from pipelines.mlflow_tracker import MlflowTracker  # 3 s: only when something is launched
 
     card = study_card(study)
     tracker = MlflowTracker(card, home)
-    status: Status = "interrupted"
+    recorder = None
     try:
-        plan = items(study, fingerprint(), commit(), host())
-        with board(Console()) as display:
-            recorder = Recorder(card, plan, tracker, home, display)
-            if recorder.skipped:
-                display.say(f"{recorder.skipped} of {len(plan)} runs were finished before")
-            left = recorder.reuse()
-            while left and not interrupts.came:
-                train(study, recorder, home, interrupts)
-                left = recorder.again()
-            recorder.overview.publish()
-        status = "failed" if recorder.failures else "interrupted" if recorder.left else "finished"
+        recorder = Recorder(card, items(study, fingerprint(), commit(), host()), tracker, home, display)
+        yield Launched(study, tracker, recorder)
     finally:
-        tracker.close(status)
-    _summary(study, recorder, tracker)
-    return {"finished": DONE, "failed": FAILED}.get(status, interrupts.code)
+        tracker.close(recorder.status if recorder else "interrupted")
 
 
 # Ray
 
 
-def train(study: Study, recorder: Recorder, home: Home, interrupts: Interrupts) -> None:
-    """Train what the recorder still waits for, but for what another study is training at this moment.
+def train(studies: Sequence[Study], recorders: Recorders, home: Home, interrupts: Interrupts) -> None:
+    """Train what the recorders still wait for, but for what another launch is training at this moment.
 
     Raises:
         StoreError: the log failed, or Ray cannot be reached.
@@ -153,29 +196,30 @@ def train(study: Study, recorder: Recorder, home: Home, interrupts: Interrupts) 
     set_up_ray()
     from pipelines.ray_driver import fit, ray_session  # 3 s
 
-    scratch = home.scratch(study.name, study.profile)
+    first, resources = studies[0], studies[0].resources
+    scratch = home.scratch(first.name, first.profile)  # held by this launch, as the study is
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)
     stop = scratch / "stop"
-    drawn = animated(study, recorder.plan)
+    plans = [one.plan for one in recorders.each]
+    drawn = set().union(*(animated(study, plan) for study, plan in zip(studies, plans, strict=True)))
     jobs = [
         {
             "key": item.key,
             "spec": item.spec.canonical(),
             "folder": str(home.checkpoints(item.key)),
-            "checkpoint_every": study.resources.checkpoint_every,
+            "checkpoint_every": resources.checkpoint_every,
             "stop": str(stop),
             "animate": item.key in drawn,
         }
-        for item in recorder.todo()
+        for item in recorders.todo()
     ]
-    concurrent, cpus = study.resources.concurrent, study.resources.cpus
-    session = ray_session(concurrent, cpus, home.name(study.name, study.profile), home.root)
+    session = ray_session(resources.concurrent, resources.cpus, home.name(first.name, first.profile), home.root)
     try:
         with session as remarks, interrupts.go_to(stop):
             for remark in remarks:
-                recorder.board.say(remark)
-            fit(jobs, recorder, scratch, concurrent, cpus, stop)
+                recorders.board.say(remark)
+            fit(jobs, recorders, scratch, resources.concurrent, resources.cpus, stop)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
 
@@ -191,27 +235,33 @@ def animated(study: Study, plan: list[Item]) -> set[str]:
 # What a person reads
 
 
-def _summary(study: Study, recorder: Recorder, tracker: "MlflowTracker") -> None:
+def _summary(launched: Sequence[Launched]) -> None:
     console = Console()
     console.print()
-    print_table(console, ["arm", "finished", "mean return"], _arms(recorder.plan, tracker))
-    for name, error in recorder.failures.items():
-        console.print(f"failed: {name}: {error}", markup=False, highlight=False, soft_wrap=True)
-    next_command = f"rhmc {'study run' if recorder.left else 'export'} {_arguments(study)}"
-    next_command += "   (continues)" if recorder.left else ""
+    several = len(launched) > 1
+    rows = [[*[one.study.name][:several], *row] for one in launched for row in _arms(one.recorder.plan, one.tracker)]
+    print_table(console, [*["study"][:several], "arm", "finished", "mean return"], rows)
+    for one in launched:
+        for name, error in one.recorder.failures.items():
+            console.print(f"failed: {name}: {error}", markup=False, highlight=False, soft_wrap=True)
+    tracker, left = launched[0].tracker, any(one.recorder.left for one in launched)
+    experiments = ", ".join(repr(one.tracker.name) for one in launched)
     lines = [
         f"look:  {tracker.where()}",
-        f"       experiment {tracker.name!r} in {without_password(tracker.uri)}",
-        f"next:  {next_command}",
+        f"       experiment{'s' * several} {experiments} in {without_password(tracker.uri)}",
+        f"next:  rhmc {'study run' if left else 'export'} {_arguments([one.study for one in launched])}",
     ]
+    lines[-1] += "   (continues)" if left else ""
     console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
 
 
-def _arguments(study: Study) -> str:
-    """What names this plan on the command line."""
+def _arguments(studies: Sequence[Study]) -> str:
+    """What names these plans on the command line, which gives all of them the same options."""
+    study = studies[0]
     changes = [word for text in study.overrides for word in ("--set", text)]
     variant = ["--variant", study.variant] if study.variant else []
-    return shlex.join([study.file or f"studies/{study.name}.yaml", "--profile", study.profile, *variant, *changes])
+    files = [one.file or f"studies/{one.name}.yaml" for one in studies]
+    return shlex.join([*files, "--profile", study.profile, *variant, *changes])
 
 
 def _arms(plan: list[Item], tracker: Tracker) -> list[list[str]]:

@@ -70,7 +70,7 @@ def run_search(search: Search, home: Path, out: Path | None = None) -> int:
             assert storage is not None
             return _launch(search, place, storage, out or found_folder(search, place), interrupts)
 
-    return guarded(home, search.name, search.profile, launch)
+    return guarded(home, [(search.name, search.profile)], launch)
 
 
 def found_folder(search: Search, home: Home) -> Path:

@@ -3,8 +3,9 @@
 A file has `question`, `base` (env, algo, trainer), `arms` (each changes the base), `seeds` and `steps` (a number, or
 one for each profile), and may have `grid` (lists of values for dotted keys: every arm, or the base without arms, is
 taken to every combination), `variants` (each changes every arm, whatever its kind), `profiles` (what else a profile
-changes in the base; the arms and the values of the grid that it is content with) and `resources`. The layers of a run
-are base, profile, arm, point of the grid, variant. All that is wrong with a file is found before anything starts.
+changes in the base, and in single arms as `changes`; the arms and the values of the grid that it is content with) and
+`resources`. The layers of a run are base, profile, arm, the profile's change of the arm, point of the grid, variant.
+All that is wrong with a file is found before anything starts.
 """
 
 import hashlib
@@ -197,9 +198,10 @@ Grid = dict[str, Annotated[list[Any], Field(min_length=1)]]  # by dotted name of
 
 
 class Profile(Layer):
-    """What a profile changes in the base, which arms it is content with, and which values of the grid."""
+    """What a profile changes in the base and in single arms, which it is content with, and which values of the grid."""
 
     arms: list[str] | None = Field(None, min_length=1)
+    changes: dict[str, Layer] = Field(default_factory=dict)
     grid: Grid = Field(default_factory=dict)
 
 
@@ -381,7 +383,7 @@ def _settings(root: Node, profile: str, variant: str | None, patches: Sequence[N
     last = [layer for layer in [_child(_child(root, "variants"), variant or "")] if layer]
     steps = _child(_child(root, "steps"), profile)
     base, faults = _setting([*common, *last] if common else [], steps)
-    planned, found = _planned(root, chosen)
+    planned, found = _planned(root, chosen, patches)
     faults += found + [fault for layer in last for fault in _unstated(common[0] if common else None, layer)]
     arms: dict[str, Setting] = {}
     first: dict[str, str] = {}  # arm by its setting
@@ -395,20 +397,34 @@ def _settings(root: Node, profile: str, variant: str | None, patches: Sequence[N
             same = first.setdefault(setting.canonical(), name)
             faults += _twin(same, arm, name, variant) if same != name else []
             arms[name] = setting
-    plain = ("arms.",) if _group(root, "arms") else ("arms.", "grid.")
+    plain = ("arms.", f"profiles.{profile}.changes.", *(() if _group(root, "arms") else ("grid.",)))
     faults += [f if f.path.startswith(plain) else _owned(f, names) for f, names in owners.items()]
     kept, found = _kept(root, chosen)
     arms = {name: arm for name, arm in arms.items() if kept is None or planned[name][0] in kept}
     return Resolved(base, arms, faults + found)
 
 
-def _planned(root: Node, profile: Node | None) -> tuple[dict[str, tuple[str, Node]], list[Fault]]:
+def _planned(
+    root: Node, profile: Node | None, patches: Sequence[Node]
+) -> tuple[dict[str, tuple[str, Node]], list[Fault]]:
     """Every arm of a profile at every point of its grid, by name: the arm as written, and all that it states."""
-    arms = _group(root, "arms")
-    faults = [fault for name, arm in arms.items() for fault in _name_faults(name, arm)]
+    arms, faults = _changed(_group(root, "arms"), profile, patches)
     grid, found = replaced(_child(root, "grid"), _child(profile, "grid"))
     combined, more = points(grid, FIELDS, len(arms))
     return _crossed(arms, combined), faults + found + more
+
+
+def _changed(
+    arms: dict[str, Node], profile: Node | None, patches: Sequence[Node]
+) -> tuple[dict[str, Node], list[Fault]]:
+    """The arms with what a profile changes in them. Overrides, which the arms hold already, go before that."""
+    faults = [fault for name, arm in arms.items() for fault in _name_faults(name, arm)]
+    changes = _group(profile, "changes") if profile else {}
+    unknown = {name: node for name, node in changes.items() if name not in arms}
+    faults += [Fault(n.key, n.path, f"{show(name)} is no arm; {choices(name, arms)}") for name, n in unknown.items()]
+    layers = [changes, *(_group(patch, "arms") for patch in patches)] if changes else []
+    changed = {name: [layer[name] for layer in layers if name in layer] for name in arms if name in changes}
+    return {name: reduce(merge, changed.get(name, []), arm) for name, arm in arms.items()}, faults
 
 
 def _crossed(arms: Mapping[str, Node], combined: Sequence[Point]) -> dict[str, tuple[str, Node]]:

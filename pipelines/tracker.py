@@ -6,7 +6,6 @@ already continues it. A point that is logged already is not logged again.
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import count
 from pathlib import Path
 from types import MappingProxyType
 from typing import Literal, NamedTuple, Protocol
@@ -204,7 +203,6 @@ class MemoryTracker:
 
     def __init__(self, study: StudyCard, shelf: list[MemoryRun]) -> None:
         self.study, self.shelf = study, shelf
-        self.names = count(len(shelf))
         self.note, self.files = study.note, dict[str, bytes]()
         self._interrupt_running()
 
@@ -242,7 +240,7 @@ class MemoryTracker:
             if (run.card.arm, run.card.key) == (card.arm, card.key):
                 run.status = "running"
                 return run
-        run = MemoryRun(f"run-{next(self.names)}", self.study, card)
+        run = MemoryRun(f"run-{len(self.shelf)}", self.study, card)
         self.shelf.append(run)
         return run
 

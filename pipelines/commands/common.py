@@ -41,6 +41,7 @@ def _profiles(incomplete: str) -> list[str]:
 File = Annotated[
     Path, typer.Argument(metavar="FILE", help="A study, such as studies/ablation.yaml.", autocompletion=_studies)
 ]
+Files = Annotated[list[Path], typer.Argument(metavar="FILE...", help="Studies.", autocompletion=_studies)]
 Profile = Annotated[str, typer.Option(help="The budget: quick or paper.", autocompletion=_profiles)]
 Variant = Annotated[str | None, typer.Option(help="One of the file's variants, which changes every arm.")]
 Sets = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help=SET_HELP)]
@@ -56,6 +57,25 @@ def load_study(file: Path, profile: str, overrides: Sequence[str] | None, varian
     from pipelines.study import Study
 
     return Study.load(file, profile, overrides or [], variant)
+
+
+def load_studies(
+    files: Sequence[Path], profile: str, overrides: Sequence[str] | None, variant: str | None
+) -> "list[Study]":
+    """The studies that the options name, all of which take the same options.
+
+    Raises:
+        InputError: with every fault of all of them.
+    """
+    studies, faults = [], []
+    for file in files:
+        try:
+            studies.append(load_study(file, profile, overrides, variant))
+        except InputError as error:
+            faults += str(error).splitlines()
+    if faults:
+        raise InputError("\n".join(dict.fromkeys(faults)))  # a fault of an option is the same for each
+    return studies
 
 
 @contextmanager

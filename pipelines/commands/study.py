@@ -7,7 +7,21 @@ from typing import Annotated, Any
 
 import typer
 
-from pipelines.commands.common import BAD, File, Json, Profile, Sets, Variant, load_study, say, say_json, table
+from pipelines.commands.common import (
+    BAD,
+    DONE,
+    File,
+    Files,
+    Json,
+    Profile,
+    Sets,
+    Variant,
+    load_studies,
+    load_study,
+    say,
+    say_json,
+    table,
+)
 from pipelines.errors import InputError
 
 app = typer.Typer(help="Check, run, follow and move studies.", no_args_is_help=True)
@@ -30,13 +44,16 @@ def check(file: File, profile: Profile = "quick", variant: Variant = None, overr
 
 
 @app.command("run")
-def run(file: File, profile: Profile = "quick", variant: Variant = None, overrides: Sets = None) -> None:
-    """Run what a study still lacks. Finished runs are skipped, interrupted ones continue."""
-    study = load_study(file, profile, overrides, variant)
-    from pipelines.run import run_study
+def run(files: Files, profile: Profile = "quick", variant: Variant = None, overrides: Sets = None) -> None:
+    """Run what studies still lack. Finished runs are skipped, interrupted ones continue.
+
+    Several files are one queue: what they share is trained once.
+    """
+    studies = load_studies(files, profile, overrides, variant)
+    from pipelines.run import run_studies
     from pipelines.store import work_folder
 
-    raise typer.Exit(run_study(study, work_folder()))
+    raise typer.Exit(run_studies(studies, work_folder()))
 
 
 @app.command("status")
@@ -126,19 +143,24 @@ def import_runs(
 
 
 def export(
-    file: File,
+    files: Files,
     profile: Profile = "quick",
     variant: Variant = None,
     out: Annotated[Path | None, typer.Option(help="Folder; reports/<profile>/runs if not given.")] = None,
     overrides: Sets = None,
 ) -> None:
-    """Write a study's results as one tidy table and a table of its runs, for the report."""
-    study = load_study(file, profile, overrides, variant)
+    """Write each study's results as one tidy table and a table of its runs, for the report."""
+    studies = load_studies(files, profile, overrides, variant)
     from pipelines.export import export_study
 
-    code = export_study(study, out or Path("reports") / profile / "runs")
-    if code != BAD:
-        words = ["rhmc", "report", "--study", str(file), *(["--profile", profile] if profile != "quick" else [])]
-        words += [*(["--variant", variant] if variant else []), *(["--runs", str(out)] if out else [])]
-        print(f"next:  {shlex.join(words)}", file=sys.stderr)
+    code = DONE
+    for study in studies:
+        code = max(code, export_study(study, out or Path("reports") / profile / "runs"))
+        if code == BAD:
+            raise typer.Exit(BAD)
+    words = ["rhmc", "report", *(["--study", str(files[0])] if len(files) == 1 else [])]
+    words += ["--profile", profile] if profile != "quick" else []
+    words += ["--variant", variant] if variant and len(files) == 1 else []
+    words += ["--runs", str(out)] if out else []
+    print(f"next:  {shlex.join(words)}", file=sys.stderr)
     raise typer.Exit(code)

@@ -34,7 +34,7 @@ from pipelines import ray_driver, run
 from pipelines.mlflow_tracker import open_existing
 from pipelines.names import full
 from pipelines.plan import study_card
-from pipelines.recorder import Recorder
+from pipelines.recorders import Recorders
 from pipelines.store import Home
 from pipelines.study import Study
 from pipelines.trainable import RunTrainable
@@ -213,7 +213,7 @@ def _drive(study: str, home: str, uri: str | None, length: int, room: int | None
     ray_driver.fit = fit_here
     fuse = Fuse(length)
     fuse.lay(home)
-    status = run.run_study(Study.model_validate_json(study), Path(home))
+    status = run.run_studies([Study.model_validate_json(study)], Path(home))
     (Path(home) / "writes").write_text(str(fuse.count))
     sys.exit(status)
 
@@ -233,7 +233,7 @@ def _settle(log: Path) -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def fit_here(jobs: list[dict[str, Any]], recorder: Recorder, *rest: Any) -> None:
+def fit_here(jobs: list[dict[str, Any]], recorder: Recorders, *rest: Any) -> None:
     """What `ray_driver.fit` does, one job after the other in this process."""
     for job in jobs:
         worker = RunTrainable({"job": job})

@@ -219,7 +219,7 @@ def main() -> int:
     chosen = parser.parse_args()
     if chosen.drive:
         run.fingerprint = lambda: CODE
-        return run.run_study(study(chosen.points), chosen.drive)
+        return run.run_studies([study(chosen.points)], chosen.drive)
     start = time.monotonic()
     with TemporaryDirectory(ignore_cleanup_errors=True) as temporary:
         done, wrong = soak(chosen.folder or Path(temporary), chosen.kills, chosen.seed, chosen.points)

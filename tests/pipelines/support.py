@@ -54,4 +54,4 @@ if __name__ == "__main__":
     from pipelines import run
 
     run.fingerprint = lambda: CODE
-    sys.exit(run.run_study(tiny(points=int(sys.argv[2])), Path(sys.argv[1])))
+    sys.exit(run.run_studies([tiny(points=int(sys.argv[2]))], Path(sys.argv[1])))

@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -211,7 +212,8 @@ def test_status_for_scripts(rhmc: Rhmc) -> None:
 def test_every_verb_of_studies_takes_a_variant(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> None:
     Path("studies/x.yaml").write_text(STUDY + "variants: {large: {algo: {hidden: 128}}}\n")
     names: list[str] = []
-    for place in ("run.run_study", "run.show_status", "export.export_study"):
+    monkeypatch.setattr("pipelines.run.run_studies", lambda studies, home: names.append(studies[0].name) or 0)
+    for place in ("run.show_status", "export.export_study"):
         monkeypatch.setattr(f"pipelines.{place}", lambda study, *a, **k: names.append(study.name) or 0)
     for verb in (["study", "run"], ["study", "status"], ["export"]):
         rhmc(*verb, "studies/x.yaml", "--variant", "large")
@@ -249,14 +251,36 @@ def test_the_doctor_answers_with_lines_and_an_exit_code(
 
 
 @pytest.mark.parametrize("code", [0, 1, 2, 130])
-def test_run_hands_on_the_study_the_work_folder_and_the_exit_code(
+def test_run_hands_on_the_studies_the_work_folder_and_the_exit_code(
     rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, code: int
 ) -> None:
     calls: list[tuple[Any, ...]] = []
-    monkeypatch.setattr("pipelines.run.run_study", lambda *given: calls.append(given) or code)
-    assert rhmc("study", "run", "studies/x.yaml", "--profile", "paper", "--set", "seeds=1").code == code
-    ((study, home),) = calls
-    assert (study.name, study.profile, study.seeds, home) == ("x", "paper", 1, tmp_path / "work")
+    monkeypatch.setattr("pipelines.run.run_studies", lambda *given: calls.append(given) or code)
+    shutil.copy("studies/x.yaml", "studies/y.yaml")
+    words = ["studies/x.yaml", "studies/y.yaml", "--profile", "paper", "--set", "seeds=1"]
+    assert rhmc("study", "run", *words).code == code
+    ((studies, home),) = calls
+    assert [(study.name, study.profile, study.seeds) for study in studies] == [("x", "paper", 1), ("y", "paper", 1)]
+    assert home == tmp_path / "work"
+
+
+def test_what_is_wrong_with_several_studies_is_said_at_once(rhmc: Rhmc, tmp_path: Path) -> None:
+    Path("studies/y.yaml").write_text(STUDY.replace("regulator: none", "regulator: non"))
+    said = rhmc("study", "run", "studies/x.yaml", "studies/y.yaml", "studies/z.yaml", "--set", "seed=1")
+    lines = said.err.splitlines()
+    assert said.code == 2
+    assert [line.partition(":")[0] for line in lines] == ["--set seed=1", "studies/y.yaml", "studies/z.yaml"]
+    assert not (tmp_path / "work").exists()
+
+
+def test_studies_that_cannot_run_together(rhmc: Rhmc, tmp_path: Path) -> None:
+    Path("studies/y.yaml").write_text(STUDY + "resources: {concurrent: 3}\n")
+    said = rhmc("study", "run", "studies/x.yaml", "studies/y.yaml", "studies/x.yaml")
+    twice, shared = said.err.splitlines()
+    assert said.code == 2
+    assert twice == "x: given 2 times; studies that run together need names of their own"
+    assert shared.startswith("resources.concurrent is 3 in y and 2 in x; ")
+    assert not (tmp_path / "work").exists()
 
 
 def test_export_goes_to_the_folder_of_the_profile(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -270,11 +294,21 @@ def test_export_goes_to_the_folder_of_the_profile(rhmc: Rhmc, monkeypatch: pytes
     assert calls == [("x", Path("reports/paper/runs")), ("x", Path("there"))]
 
 
+def test_export_of_several_studies(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copy("studies/x.yaml", "studies/y.yaml")
+    codes = {"x": 1, "y": 0}
+    monkeypatch.setattr("pipelines.export.export_study", lambda study, out: codes[study.name])
+    words = ["export", "studies/x.yaml", "studies/y.yaml"]
+    assert rhmc(*words) == (1, "", "next:  rhmc report\n")
+    codes["x"] = 2
+    assert rhmc(*words) == (2, "", "")
+
+
 def test_an_interrupt_is_130(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(*_: Any) -> int:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pipelines.run.run_study", interrupted)
+    monkeypatch.setattr("pipelines.run.run_studies", interrupted)
     assert rhmc("study", "run", "studies/x.yaml").code == 130
 
 

@@ -17,7 +17,7 @@ import pytest
 from pipelines.export import export_study
 from pipelines.mlflow_tracker import open_existing
 from pipelines.plan import study_card
-from pipelines.run import run_study
+from pipelines.run import run_studies
 from pipelines.store import Home
 from tests.pipelines.chaos import WORKER, started_by
 from tests.pipelines.support import CODE, tiny
@@ -41,7 +41,7 @@ def uninterrupted(tmp_path_factory: pytest.TempPathFactory, template: Path, clus
     """The export of a launch that nobody disturbed."""
     home = tmp_path_factory.mktemp("whole")
     shutil.copy(template, home / "mlflow.db")
-    assert run_study(STUDY, home) == 0
+    assert run_studies([STUDY], home) == 0
     assert export_study(STUDY, home / "out", home) == 0
     return (home / "out" / "tiny.parquet").read_bytes()
 
@@ -80,7 +80,7 @@ def statuses(home: Path) -> dict[str, str]:
 def finish(home: Path, expected: bytes) -> None:
     """Launch again: the same runs, whole, nothing doubled."""
     before = statuses(home)
-    assert run_study(STUDY, home) == 0
+    assert run_studies([STUDY], home) == 0
     after = statuses(home)
     assert before.keys() <= after.keys()
     assert list(after.values()) == ["finished", "finished"]

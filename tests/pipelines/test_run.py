@@ -30,7 +30,8 @@ from pipelines.plan import Item, items, study_card, what_varies
 from pipelines.progress import LiveBoard, PlainBoard, duration
 from pipelines.ray_driver import sockets
 from pipelines.recorder import Recorder
-from pipelines.run import Interrupts, _arguments, animated, run_study, show_status
+from pipelines.recorders import Recorders
+from pipelines.run import Interrupts, _arguments, animated, run_studies, show_status
 from pipelines.store import Checkpoints, Home, StoreError
 from pipelines.study import Study
 from pipelines.tracker import MemoryRun, MemoryTracker, StudyCard, points_of
@@ -196,8 +197,9 @@ def test_what_another_process_trains_is_waited_for(launch: Launch, shelf: list[M
     recorder.result(key, {"done": True, "stopped": True, "busy": True, "points": []})
     step(recorder, free, stopped=True)
     assert [run.status for run in shelf] == ["interrupted", "interrupted"]
-    assert recorder.again()
-    assert not recorder.again()  # asked for once
+    together = Recorders([recorder])
+    assert together.again()
+    assert not together.again()  # asked for once
 
 
 def test_a_run_whose_node_died_is_trained_once_more(launch: Launch, shelf: list[MemoryRun]) -> None:
@@ -209,7 +211,7 @@ def test_a_run_whose_node_died_is_trained_once_more(launch: Launch, shelf: list[
     assert shelf[0].tags["nodes"] == "host (a), host (b)"
     recorder.lost(key)
     assert shelf[0].status == "interrupted"
-    assert recorder.again()
+    assert Recorders([recorder]).again()
     assert key in [item.key for item in recorder.todo()]
     assert recorder.failures == {}
 
@@ -362,7 +364,7 @@ def test_runs_of_a_killed_driver_are_not_said_to_be_running(home: Path, capsys: 
 
 def test_a_second_driver_is_refused(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with Home(home).lock("tiny", "quick"):
-        assert run_study(tiny(), home) == 2
+        assert run_studies([tiny()], home) == 2
     message = capsys.readouterr().err
     assert f"tiny (quick) is already being run by process {os.getpid()}" in message
     assert message.count("\n") == 1
@@ -372,7 +374,7 @@ def test_a_second_driver_is_refused(home: Path, capsys: pytest.CaptureFixture[st
 
 def test_a_work_folder_that_cannot_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "file").touch()
-    assert run_study(tiny(), tmp_path / "file" / "work") == 2
+    assert run_studies([tiny()], tmp_path / "file" / "work") == 2
     message = capsys.readouterr().err
     assert message.startswith(f"rhmc: {tmp_path}/file/work: cannot be written to: ")
     assert message.count("\n") == 1
@@ -380,7 +382,7 @@ def test_a_work_folder_that_cannot_be(tmp_path: Path, capsys: pytest.CaptureFixt
 
 def test_a_foreign_store(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "mlflow.db").write_text("not a database\n" * 100)
-    for command in (run_study, show_status):
+    for command in (lambda study, home: run_studies([study], home), show_status):
         assert command(tiny(), tmp_path) == 2
         message = capsys.readouterr().err
         assert f"{tmp_path}/mlflow.db: not an MLflow database" in message
@@ -403,7 +405,7 @@ def test_a_server_that_is_not_mlflow(
         threading.Thread(target=server.serve_forever, daemon=True).start()
         uri = f"http://127.0.0.1:{server.server_port}"
         monkeypatch.setenv("MLFLOW_TRACKING_URI", uri)
-        assert run_study(tiny(), home) == 2
+        assert run_studies([tiny()], home) == 2
         server.shutdown()
     message = capsys.readouterr().err
     assert uri in message
@@ -425,7 +427,7 @@ def test_a_signal_outside_training_ends_the_launch(
 ) -> None:
     monkeypatch.setattr(run, "_launch", lambda *args: signal.raise_signal(number))
     before = signal.getsignal(number)
-    assert run_study(tiny(), tmp_path) == code
+    assert run_studies([tiny()], tmp_path) == code
     assert signal.getsignal(number) is before
     with Home(tmp_path).lock("tiny", "quick"):
         pass  # let go of
@@ -433,7 +435,7 @@ def test_a_signal_outside_training_ends_the_launch(
 
 def test_rays_own_answer_to_sigterm_ends_the_launch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run, "_launch", lambda *args: sys.exit(15))
-    assert run_study(tiny(), tmp_path) == 143
+    assert run_studies([tiny()], tmp_path) == 143
 
 
 def test_the_first_signal_in_training_asks_and_the_second_ends(tmp_path: Path) -> None:
@@ -525,7 +527,7 @@ def test_a_run_that_another_process_trains_is_trained_when_that_lets_go(
     Home(home).checkpoints(key).parent.mkdir()
     held = FileLock(f"{Home(home).checkpoints(key)}.lock")
     held.acquire()
-    assert run_study(tiny(), home) == 0
+    assert run_studies([tiny()], home) == 0
     assert launches == [[key, launches[0][1]], [key]]
     assert "slow s0: another process is training it; waiting for that" in capsys.readouterr().out
 
@@ -538,7 +540,7 @@ def test_run_skip_fail_and_retry(home: Path, cluster: None, capsys: pytest.Captu
     blocked.parent.mkdir()
     blocked.touch()  # a file where the checkpoints of `slow` should go
 
-    assert run_study(study, home) == 1
+    assert run_studies([study], home) == 1
     said = capsys.readouterr()
     assert f"failed: {study.name} / slow s0: " in said.out
     assert str(blocked) in said.out
@@ -552,13 +554,13 @@ def test_run_skip_fail_and_retry(home: Path, cluster: None, capsys: pytest.Captu
     assert show_status(study, home) == 1
 
     blocked.unlink()
-    assert run_study(study, home) == 0
+    assert run_studies([study], home) == 0
     assert "1 of 2 runs were finished before" in capsys.readouterr().out
     after = {run.arm: run for run in tracker.recorded()}
     assert {arm: run.ref for arm, run in after.items()} == {arm: run.ref for arm, run in before.items()}
     assert {run.status for run in after.values()} == {"finished"}
 
-    assert run_study(study, home) == 0  # nothing to do, and Ray is not asked
+    assert run_studies([study], home) == 0  # nothing to do, and Ray is not asked
     assert show_status(study, home) == 0
     assert not (home / "ray").exists() or not list((home / "ray").iterdir())
 
@@ -608,7 +610,7 @@ def test_a_log_that_fails_stops_the_study(
         raise StoreError("the disk is full")
 
     monkeypatch.setattr(Recorder, "result", full)
-    assert run_study(tiny(points=300), home) == 2
+    assert run_studies([tiny(points=300)], home) == 2
     assert capsys.readouterr().err == "rhmc: the disk is full\n"
     tracker = open_existing(study_card(tiny()), Home(home))
     assert tracker is not None
@@ -623,7 +625,7 @@ def test_a_run_that_is_stopped_before_it_begins_has_not_failed(
     from pipelines.ray_driver import Bridge, fit
 
     monkeypatch.setattr(Bridge, "over", property(lambda self: self.error is not None))
-    recorder, stop = launch(), home / "stop"
+    recorder, stop = Recorders([launch()]), home / "stop"
     stop.touch()
     jobs = [
         {
@@ -636,8 +638,8 @@ def test_a_run_that_is_stopped_before_it_begins_has_not_failed(
         for i in recorder.todo()
     ]
     fit(jobs, recorder, home / "scratch", 1, 1, stop)
-    assert recorder.failures == {}
-    assert recorder.left == 2
+    (alone,) = recorder.each
+    assert (alone.failures, alone.left) == ({}, 2)
     assert not list(home.rglob("*.pt"))
 
 
@@ -650,9 +652,9 @@ def test_a_setting_that_one_method_lacks_does_not_vary_for_that() -> None:
 
 def test_the_next_command_names_the_variant() -> None:
     study = Study.load(STUDIES / "ablation.yaml", "quick", ["seeds=1"], "letter")
-    assert _arguments(study) == f"{STUDIES / 'ablation.yaml'} --profile quick --variant letter --set seeds=1"
+    assert _arguments([study]) == f"{STUDIES / 'ablation.yaml'} --profile quick --variant letter --set seeds=1"
 
 
 def test_the_next_command_names_the_file_and_the_changes() -> None:
     study = Study.load(STUDIES / "coverage.yaml", "quick", ["seeds=1", "algo.alpha=0.1"])
-    assert _arguments(study) == f"{STUDIES / 'coverage.yaml'} --profile quick --set seeds=1 --set algo.alpha=0.1"
+    assert _arguments([study]) == f"{STUDIES / 'coverage.yaml'} --profile quick --set seeds=1 --set algo.alpha=0.1"

@@ -71,6 +71,18 @@ def test_arms_change_the_base_and_nothing_else() -> None:
     assert study.arms["IQL"].algo.lr == pytest.approx(5e-4)
 
 
+def test_a_profile_changes_single_arms() -> None:
+    text = GOOD + "profiles: {quick: {changes: {IQL: {algo: {lr: 0.5}, env: {agents: 3}}}}}"
+    quick, paper = load(text), load(text, "paper")
+    assert paper.arms == load(GOOD, "paper").arms
+    assert {name for name in quick.arms if quick.arms[name] != load(GOOD).arms[name]} == {"IQL"}
+    assert (quick.arms["IQL"].algo.lr, quick.arms["IQL"].env.agents) == (0.5, 3)
+    assert quick.arms["IQL"].algo.batch == paper.arms["IQL"].algo.batch
+    over = load(text, "quick", "arms.IQL.algo.lr=0.25")
+    assert (over.arms["IQL"].algo.lr, over.arms["IQL"].env.agents) == (0.25, 3)
+    assert load(text, "quick", "profiles.quick.changes.IQL.algo.lr=0.125").arms["IQL"].algo.lr == 0.125
+
+
 def test_profiles_choose_seeds_steps_and_the_trainer() -> None:
     text = GOOD.replace(
         "steps: 1000", "steps: {quick: 1_000, paper: 5e6}\nprofiles: {quick: {trainer: {evaluations: 7}}}"
@@ -305,6 +317,10 @@ GRIDS = [
      ["15:27: profiles.quick.grid.env.agent: 'env.agent' is no key of the grid; did you mean 'env.agents'?"]),
     ("steps: 1000", "steps: 9\nprofiles: {quick: {arms: [ful]}}",
      ["15:27: profiles.quick.arms.0: 'ful' is no arm; allowed: full, none, IQL; did you mean 'full'?"]),
+    ("steps: 1000", "steps: 9\nprofiles: {quick: {changes: {ful: {algo: {lr: 1}}}}}",
+     ["15:30: profiles.quick.changes.ful: 'ful' is no arm; allowed: full, none, IQL; did you mean 'full'?"]),
+    ("steps: 1000", "steps: 9\nprofiles: {quick: {changes: {full: {algo: {lrr: 1}}}}}",
+     ["15:44: profiles.quick.changes.full.algo.lrr: unknown key 'lrr'; allowed: ... did you mean 'lr'?"]),
     ("steps: 1000", "steps: 9\nprofiles: {quick: {arms: [[ful]]}}",
      ['15:27: profiles.quick.arms.0: ["ful"] is not allowed; must be a valid string']),
 ]  # fmt: skip
