@@ -244,7 +244,9 @@ def test_every_method_has_a_row_in_the_list_of_departures() -> None:
 
 @pytest.fixture(scope="module")
 def stages() -> dict:
-    return YAML(typ="safe").load((ROOT / "dvc.yaml").read_text(encoding="utf-8"))["stages"]
+    """By name; under `vars` what they share."""
+    pipeline = YAML(typ="safe").load((ROOT / "dvc.yaml").read_text(encoding="utf-8"))
+    return pipeline["stages"] | {"vars": {name: v for one in pipeline["vars"] for name, v in one.items()}}
 
 
 FOR_COPYING = "template"  # answers no question of the report
@@ -253,7 +255,12 @@ FOR_COPYING = "template"  # answers no question of the report
 def test_every_study_is_in_the_pipeline(stages: dict) -> None:
     """A search is run by hand: what it finds is kept in `studies/found`, and a study that includes it is here."""
     studies = {p.stem for p in (ROOT / "studies").glob("*.yaml") if not is_search(p)} - {FOR_COPYING}
-    assert unmatched("dvc.yaml", studies, stages["study"]["foreach"]) == []
+    stage, queue = stages["studies"], stages["vars"]["queue"].split()
+    assert [command.split()[-3:] for command in stage["cmd"]] == [["${queue}", "--profile", "${profile}"]] * 2
+    assert unmatched("dvc.yaml", {f"studies/{name}.yaml" for name in studies}, queue) == []
+    tables = {f"reports/${{profile}}/runs/{name}{kind}.parquet" for name in studies for kind in ("", ".runs")}
+    assert unmatched("dvc.yaml", tables, [next(iter(out)) for out in stage["outs"]]) == []
+    assert "studies" in stage["deps"]  # the whole folder, and with it what a study includes
 
 
 def is_search(path: Path) -> bool:
@@ -264,12 +271,6 @@ def is_search(path: Path) -> bool:
     return path.stem.startswith("search_")
 
 
-def test_a_stage_depends_on_what_its_studies_include(stages: dict) -> None:
-    texts = [p.read_text(encoding="utf-8") for p in (ROOT / "studies").glob("*.yaml")]
-    if any(re.search(r"\binclude: *found/", text) for text in texts):
-        assert "studies/found" in stages["study"]["do"]["deps"]
-
-
 def test_the_report_depends_on_all_its_modules(stages: dict) -> None:
     found = [p for p in (ROOT / "reports").glob("*") if p.suffix in {".py", ".yaml", ".j2"}]
     parts = {p.relative_to(ROOT).as_posix() for p in found}
@@ -278,8 +279,8 @@ def test_the_report_depends_on_all_its_modules(stages: dict) -> None:
 
 
 def test_every_stage_that_computes_waits_for_the_fingerprint(stages: dict) -> None:
-    for stage in (stages["study"]["do"], *(stages[name] for name in ("yardsticks", "theorem", "methods", "drawings"))):
-        assert ".fingerprint" in stage["deps"]
+    for name in ("studies", "yardsticks", "theorem", "methods", "drawings"):
+        assert ".fingerprint" in stages[name]["deps"]
     assert ".fingerprint" in stages["fingerprint"]["outs"][0]
 
 
