@@ -2,7 +2,10 @@
 
 import os
 import signal
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import psutil
 import pytest
@@ -11,7 +14,9 @@ import torch
 from pipelines.errors import InputError
 from pipelines.side_by_side import side_by_side
 from pipelines.store import StoreError
+from tests.pipelines.support import started_by
 
+ROOT = Path(__file__).parents[2]
 SPAWNED = "spawn_main"  # in the command line of a worker
 LONG = 60.0  # seconds that no test waits
 
@@ -110,3 +115,28 @@ def test_a_caller_with_an_error_of_its_own_does_not_wait_either() -> None:
         [1 // size for size in side_by_side(sleepy, [(0.0, b""), (LONG, b""), (LONG, b"")], 2)]
     assert time.monotonic() - begun < LONG / 2
     assert workers() == []
+
+
+@pytest.mark.parametrize("at_work", [0.0, 8.0], ids=["while they start", "at work"])  # seconds of processor time
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL], ids=lambda how: how.name)
+def test_nothing_is_left_of_a_command_that_is_stopped(how: signal.Signals, at_work: float, tmp_path: Path) -> None:
+    """Ctrl-C reaches every process of a terminal, the other signals the one that was named."""
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "pipelines.cli", "yardsticks", "all", "--profile", "paper", "--out", str(out)]
+    with (tmp_path / "said").open("w") as said:
+        process = subprocess.Popen(command, cwd=ROOT, stdout=said, stderr=said, start_new_session=True)
+    while not (found := started_by(process.pid, SPAWNED)) or sum(p.cpu_times().user for p in found) < at_work:
+        assert process.poll() is None, (tmp_path / "said").read_text()
+        time.sleep(0.02)
+    if how == signal.SIGINT:
+        os.killpg(process.pid, how)
+    else:
+        process.send_signal(how)
+    assert process.wait(30) == (130 if how == signal.SIGINT else -how)
+    end = time.monotonic() + 30
+    while left := started_by(process.pid):
+        assert time.monotonic() < end, left
+        time.sleep(0.02)
+    assert not out.exists()
+    if how == signal.SIGINT:
+        assert (tmp_path / "said").read_text().strip() == ""
