@@ -15,6 +15,7 @@ from pipelines.errors import InputError
 from pipelines.export import METRICS, read_parquet, write_parquet
 from pipelines.fingerprint import fingerprint
 from pipelines.plan import Item, chosen, items
+from pipelines.side_by_side import side_by_side
 from pipelines.study import Study
 from rhmc.regulation import exact, paper
 from rhmc.trainer import Trainer
@@ -90,27 +91,33 @@ def counts(t: Transition) -> dict[str, Tensor]:
     return found
 
 
-def watched(study: Study, arms: Sequence[str] = (), seeds: Sequence[int] = ()) -> Iterator[Watched]:
+def watched(study: Study, arms: Sequence[str] = (), seeds: Sequence[int] = (), jobs: int = 1) -> Iterator[Watched]:
     """Train the study's runs that assign targets, and watch them.
+
+    Args:
+        study: the plan.
+        arms: only these, if any are named.
+        seeds: only these, if any are named.
+        jobs: runs at a time, each in a process of its own; what is seen does not depend on it.
 
     Raises:
         InputError: there is no such arm, or none of the runs assigns targets.
+        StoreError: one of the processes was killed.
     """
     found = [item for item in chosen(study, fingerprint(), arms, seeds) if item.spec.algo.kind in ASSIGNING]
     if not found:
         raise InputError(f"{study.name} ({study.profile}): no such run assigns targets; {' and '.join(ASSIGNING)} do")
-    for item in found:
-        yield Watched(item, list(_train(item)))
+    for item, points in zip(found, side_by_side(_train, found, jobs), strict=True):
+        yield Watched(item, points)
 
 
-def _train(item: Item) -> Iterator[tuple[int, Metrics]]:
+def _train(item: Item) -> list[tuple[int, Metrics]]:
     spec = item.spec
     trainer = Trainer(spec.env, spec.algo, spec.trainer, spec.seed)
     watch = Watch(trainer.algorithm.observe)
     trainer.algorithm.observe = watch  # type: ignore[method-assign]
-    for metrics in trainer:
-        if seen := watch.take():
-            yield int(metrics["step"]), seen
+    points = ((int(metrics["step"]), watch.take()) for metrics in trainer)
+    return [(step, seen) for step, seen in points if seen]
 
 
 def rows_of(run: Watched) -> list[Row]:

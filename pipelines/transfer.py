@@ -1,6 +1,7 @@
 """Trained policies on tasks with other numbers of agents and targets than they were trained with, as a table."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,6 +10,8 @@ import pyarrow as pa
 from pipelines.errors import InputError
 from pipelines.evaluation import Bank, Policy, score
 from pipelines.export import write_parquet
+from pipelines.side_by_side import side_by_side
+from pipelines.store import without_replay
 
 FILE = "transfer.parquet"
 TRANSFER = pa.schema(
@@ -47,24 +50,49 @@ def sizes(policy: Policy, agents: Sequence[int], targets: Sequence[int]) -> list
 
 
 def transfer(
-    study: str, policies: Iterable[Policy], agents: Sequence[int], targets: Sequence[int], episodes: int
+    study: str,
+    policies: Iterable[Policy],
+    agents: Sequence[int],
+    targets: Sequence[int],
+    episodes: int,
+    jobs: int = 1,
 ) -> Iterator[Row]:
     """Play every policy on every size; rows of the schema `TRANSFER`. Every policy meets the same episodes of a size.
 
+    Args:
+        study: that trained them.
+        policies: to play.
+        agents: numbers of agents, see `sizes`.
+        targets: numbers of targets.
+        episodes: of each bank.
+        jobs: policies at a time, each in a process of its own; the rows do not depend on it.
+
     Raises:
         InputError: no such task, or a policy acts only with the numbers that it was trained with.
+        StoreError: one of the processes was killed.
     """
-    for policy in policies:
-        env = policy.saved.spec.env
-        if env.kind != "coverage":
-            raise InputError(
-                f"{policy.arm}: transfer is of coverage, where agents and targets have numbers of their own"
-            )
-        for size in sizes(policy, agents, targets):
-            found = score(policy, Bank(episodes=episodes, agents=size.agents, targets=size.targets))
-            place = (study, policy.arm, policy.saved.spec.seed, policy.saved.spec.id, f"{env.kind} {env.preset}")
-            values = (found.values["return"], found.values["return_sem"])
-            yield (*place, *size, env.agents, env.targets, episodes, *values)
+    play = partial(_play, study=study, agents=agents, targets=targets, episodes=episodes)
+    for rows in side_by_side(play, map(_light, policies), jobs):
+        yield from rows
+
+
+def _light(policy: Policy) -> Policy:
+    """A policy without the replay that a run under way has, which is too much to hand to another process."""
+    return policy._replace(saved=policy.saved._replace(algorithm=without_replay(policy.saved.algorithm)))
+
+
+def _play(policy: Policy, study: str, agents: Sequence[int], targets: Sequence[int], episodes: int) -> list[Row]:
+    """The rows of one policy."""
+    env = policy.saved.spec.env
+    if env.kind != "coverage":
+        raise InputError(f"{policy.arm}: transfer is of coverage, where agents and targets have numbers of their own")
+    rows: list[Row] = []
+    for size in sizes(policy, agents, targets):
+        found = score(policy, Bank(episodes=episodes, agents=size.agents, targets=size.targets))
+        place = (study, policy.arm, policy.saved.spec.seed, policy.saved.spec.id, f"{env.kind} {env.preset}")
+        values = (found.values["return"], found.values["return_sem"])
+        rows.append((*place, *size, env.agents, env.targets, episodes, *values))
+    return rows
 
 
 def export_transfer(rows: Iterable[Row], out: Path) -> Path:

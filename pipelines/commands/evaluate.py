@@ -72,6 +72,7 @@ def transfer(
     arm: Arms = None,
     seed: Seeds = None,
     episodes: Annotated[int, typer.Option(min=2, help="Of each bank.")] = 200,
+    jobs: Annotated[int, typer.Option(min=1, help="Policies at a time.")] = 2,
 ) -> None:
     """Play a study's trained policies with other numbers of agents and targets, and write transfer.parquet.
 
@@ -88,7 +89,8 @@ def transfer(
     study = load_study(file, profile, None, None)
     with folder_option(out):
         try:
-            rows = list(play(study.name, of_study(study, work_folder(), arm or [], seed or []), ns, ms, episodes))
+            policies = of_study(study, work_folder(), arm or [], seed or [])
+            rows = list(play(study.name, policies, ns, ms, episodes, jobs))
         except StoreError as error:
             raise InputError(str(error)) from error
         shown = [
@@ -105,6 +107,7 @@ def assignments(
     variant: Variant = None,
     arm: Arms = None,
     seed: Seeds = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Runs at a time.")] = 2,
     overrides: Sets = None,
 ) -> None:
     """Train a study's coordinators again and watch what they assign: <study>.assignments.parquet.
@@ -117,7 +120,7 @@ def assignments(
     study = load_study(file, profile, overrides, variant)
     with folder_option(out):
         columns = ("pairs", "conflicts", "free", "lost_h1", "lost_h6")
-        for run in watched(study, arm or [], seed or []):
+        for run in watched(study, arm or [], seed or [], jobs):
             written = export_assignments(study, rows_of(run), out)
             last = run.points[-1][1]
             cells = [run.item.card.arm, str(run.item.card.seed), *(f"{last[PREFIX + name]:.4f}" for name in columns)]

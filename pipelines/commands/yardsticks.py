@@ -4,12 +4,15 @@ import inspect
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipelines.commands.common import DONE, Json, folder_option, say_json, table
+from pipelines.commands.common import DONE, Json, Profile, folder_option, say_json, table
 from pipelines.errors import InputError
+
+if TYPE_CHECKING:
+    from pipelines.yardsticks import Scored
 
 app = typer.Typer(help="Score scripted policies and bounds.", no_args_is_help=True)
 
@@ -62,9 +65,9 @@ def _score(
     with folder_option(out):
         scores = yardsticks(env, chosen, episodes=episodes, seed=seed)
         if out is not None:
-            from pipelines.yardsticks import export_yardsticks
+            from pipelines.yardsticks import Bank, Scored, export_yardsticks
 
-            written = export_yardsticks(env, scores, episodes=episodes, seed=seed, profile=profile, out=out)
+            written = export_yardsticks([Scored(Bank(env, tuple(scores), episodes, seed), scores)], profile, out)
             print(f"wrote {written}", file=sys.stderr)
     if as_json:
         say_json(scores)
@@ -119,3 +122,50 @@ def navigation(
 ) -> Fields:
     """Navigation: the return and its standard error, landmarks covered at the end, collisions."""
     return {"agents": agents, "reward": reward, "order": order}
+
+
+@app.command("all")
+def everything(
+    out: Annotated[Path, typer.Option(help="Folder of the tables that the report reads; made if it is not there.")],
+    profile: Profile = "quick",
+    jobs: Annotated[int, typer.Option(min=1, help="Banks at a time.")] = 2,
+) -> None:
+    """Every task, policy and bound that the report uses: yardsticks.parquet and yardsticks.runs.parquet.
+
+    The profile decides the number of episodes. The files are written at the end, after minutes.
+    """
+    _check("coverage", [], profile)
+    from pipelines.yardsticks import banks, export_yardsticks, present, score_banks
+
+    with folder_option(out):
+        present(out)  # what cannot be brought up to date is better said before the minutes than after
+        wanted, found = banks(profile), []
+        for scored in score_banks(wanted, jobs):
+            found.append(scored)
+            policies = f"{len(scored.scores)} policies" if len(scored.scores) > 1 else next(iter(scored.scores))
+            print(f"{len(found)} of {len(wanted)}: {_named(scored)}: {policies}", file=sys.stderr, flush=True)
+        written = export_yardsticks(found, profile, out)
+    _show(found)
+    print(f"wrote {written}", file=sys.stderr)
+
+
+def _show(found: list["Scored"]) -> None:
+    """All scores, task by task."""
+    from pipelines.yardsticks import SEM_OF, TASKS
+    from rhmc.yardsticks import names
+
+    rows = sorted(
+        (TASKS.index(one.bank.env), names(one.bank.env.kind).index(name), _named(one), name, score, one.bank.env.kind)
+        for one in found
+        for name, score in one.scores.items()
+    )
+    cells = [[task, name, f"{score[SEM_OF[kind]]:.2f}", f"{score['sem']:.2f}"] for *_, task, name, score, kind in rows]
+    table(["task", "policy", "coverage or return", "sem"], cells, numbers=["coverage or return", "sem"])
+
+
+def _named(scored: "Scored") -> str:
+    """A task in words, with what sets it apart from the others."""
+    env = scored.bank.env
+    if env.kind == "coverage":
+        return f"coverage {env.preset}, {env.agents} x {env.targets}"
+    return f"navigation {env.reward}, {env.agents}"

@@ -22,7 +22,6 @@ from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import psutil
 import ray.tune.trainable.trainable
 import torch
 from mlflow.entities import ViewType
@@ -122,19 +121,6 @@ def faults(found: list[Run], expected: list[Run]) -> dict[str, int]:
             for one, other in both
         ),
     }
-
-
-# Processes to be killed
-
-
-def started_by(driver: int, name: str = "") -> list[psutil.Process]:
-    """What runs in the session of a driver, which may be gone, and has `name` in its command line."""
-    found = []
-    for process in psutil.process_iter():
-        with suppress(psutil.Error, OSError):
-            if os.getsid(process.pid) == driver and process.status() != psutil.STATUS_ZOMBIE:
-                found += [process] if name in " ".join(process.cmdline()) else []
-    return found
 
 
 # Processes that kill themselves

@@ -29,8 +29,8 @@ from pipelines.mlflow_tracker import create_database, open_existing
 from pipelines.plan import items, study_card
 from pipelines.store import Home
 from pipelines.study import Study
-from tests.pipelines.chaos import WORKER, Run, damage, everything, faults, free_port, started_by
-from tests.pipelines.support import CODE, setting, tiny
+from tests.pipelines.chaos import WORKER, Run, damage, everything, faults, free_port
+from tests.pipelines.support import CODE, setting, started_by, tiny
 
 KINDS = ("driver", "worker", "server", "driver, politely", "node")
 ROOT = Path(__file__).parents[2]

@@ -1,10 +1,17 @@
 """A tiny study, also as a program: `python -m tests.pipelines.support HOME POINTS` launches it."""
 
+import os
 import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import psutil
+import pytest
+
 from pipelines.plan import Item, items
+from pipelines.side_by_side import side_by_side
 from pipelines.study import Resources, RunSpec, Setting, Study
 
 CODE = "c0dec0dec0de"  # a fingerprint
@@ -48,6 +55,28 @@ def tiny(name: str = "tiny", points: int = 3, arms: dict[str, Setting] | None = 
 def plan(study: Study | None = None) -> list[Item]:
     """Its runs under the fingerprint `CODE`."""
     return items(study or tiny(), CODE, "abc-dirty")
+
+
+def jobs_of(module: str, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Fills with the number of processes that a module asks for, each time that it does."""
+    seen: list[int] = []
+
+    def watched(function: Callable[[Any], Any], items: Iterable[Any], jobs: int) -> Iterator[Any]:
+        seen.append(jobs)
+        return side_by_side(function, items, jobs)
+
+    monkeypatch.setattr(f"{module}.side_by_side", watched)
+    return seen
+
+
+def started_by(driver: int, name: str = "") -> list[psutil.Process]:
+    """What runs in the session of a driver, which may be gone, and has `name` in its command line."""
+    found = []
+    for process in psutil.process_iter():
+        with suppress(psutil.Error, OSError):
+            if os.getsid(process.pid) == driver and process.status() != psutil.STATUS_ZOMBIE:
+                found += [process] if name in " ".join(process.cmdline()) else []
+    return found
 
 
 if __name__ == "__main__":

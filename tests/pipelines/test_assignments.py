@@ -14,7 +14,7 @@ from pipelines.study import Study
 from rhmc.theorem import smallest_counterexample
 from rhmc.trainer import Trainer
 from rhmc.types import Local, Obs, Transition
-from tests.pipelines.support import setting, tiny
+from tests.pipelines.support import jobs_of, setting, tiny
 
 
 def rhmc_study() -> Study:
@@ -89,6 +89,18 @@ def test_watching_changes_no_training() -> None:
     assert [step for step, _ in run.points] == [int(x["step"]) for x in before[1:]]  # nothing is trained at step 0
 
 
+def test_several_runs_at_a_time_give_the_same_bytes(tmp_path: Path) -> None:
+    study = rhmc_study()
+    alone, files = list(watched(study)), []
+    for jobs in (1, 2):
+        runs = list(watched(study, jobs=jobs))
+        assert runs == alone
+        for run in runs:
+            file = export_assignments(study, rows_of(run), tmp_path / str(jobs))
+        files.append(file.read_bytes())
+    assert files[0] == files[1]
+
+
 def test_only_what_assigns_is_trained(tmp_path: Path) -> None:
     study = rhmc_study()
     runs = list(watched(study))
@@ -109,10 +121,12 @@ def test_only_what_assigns_is_trained(tmp_path: Path) -> None:
         export_assignments(study, rows_of(runs[0]), tmp_path)
 
 
+@pytest.mark.parametrize(("jobs", "asked"), [([], 2), (["--jobs", "1"], 1)])
 def test_the_command_writes_the_table(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    jobs: list[str], asked: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["studies/ablation.yaml", "--arm", "full", "--seed", "0", "--out", str(tmp_path / "out")]
+    words = ["studies/ablation.yaml", "--arm", "full", "--seed", "0", "--out", str(tmp_path / "out"), *jobs]
+    seen = jobs_of("pipelines.assignments", monkeypatch)
     small = ("steps=512", "trainer.evaluations=1", "trainer.eval_episodes=2", "trainer.final_episodes=2")
     words += [word for one in small for word in ("--set", one)]
     monkeypatch.setattr("sys.argv", ["rhmc", "assignments", *words])
@@ -122,3 +136,4 @@ def test_the_command_writes_the_table(
     assert capsys.readouterr().err == f"wrote {tmp_path / 'out' / 'ablation.assignments.parquet'}\n"
     table = pd.read_parquet(tmp_path / "out" / "ablation.assignments.parquet")
     assert table["metric"].str.startswith("assign/").all()
+    assert seen == [asked]

@@ -18,11 +18,14 @@ import pandas as pd
 import pytest
 from typer.main import get_command
 
-from pipelines import cli
+from pipelines import cli, yardsticks
 from pipelines.commands import ui
 from pipelines.commands.doctor import MARK
 from pipelines.doctor import Finding
 from pipelines.fingerprint import fingerprint
+from pipelines.side_by_side import KILLED
+from rhmc.yardsticks import names
+from tests.pipelines.support import jobs_of
 
 ROOT = Path(__file__).parents[2]
 STUDY = """\
@@ -85,6 +88,7 @@ def test_reading_a_study_needs_no_ray_and_no_mlflow() -> None:
 
 VERBS = [
     *([], ["study"], ["study", "run"], ["study", "export"], ["study", "import"], ["yardsticks"], ["evaluate"]),
+    *(["yardsticks", "all"], ["transfer"], ["assignments"]),
     *(["search"], ["search", "check"], ["search", "run"], ["search", "status"]),
     *(["export"], ["report"], ["ui"], ["doctor"]),
 ]
@@ -427,6 +431,121 @@ def test_an_export_without_a_return_is_left_out(rhmc: Rhmc) -> None:
         "o",
     )
     assert list(pd.read_parquet("o/yardsticks.runs.parquet")["arm"]) == ["hold"]
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Banks that take a second: few episodes, and three of the tasks."""
+    tasks = [yardsticks.TASKS[n] for n in (1, 5, -1)]
+    monkeypatch.setattr("pipelines.yardsticks.EPISODES", {"quick": yardsticks.Episodes(4, 2)})
+    monkeypatch.setattr("pipelines.yardsticks.TASKS", tuple(tasks))
+    monkeypatch.setattr("pipelines.yardsticks.fingerprint", lambda: "0" * 12)
+    monkeypatch.setattr("pipelines.yardsticks.commit", lambda: "abc")
+
+
+def test_all_yardsticks_are_the_same_whatever_is_played_at_a_time(
+    rhmc: Rhmc, small: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = jobs_of("pipelines.yardsticks", monkeypatch)
+    alone = rhmc("yardsticks", "all", "--out", "one", "--jobs", "1")
+    several = rhmc("yardsticks", "all", "--out", "two")
+    assert seen == [1, 2]
+    assert alone.code == several.code == 0
+    assert alone.out == several.out
+    assert several.err == alone.err.replace("one/", "two/")
+    for name in ("yardsticks.parquet", "yardsticks.runs.parquet"):
+        assert Path("one", name).read_bytes() == Path("two", name).read_bytes()
+
+
+def test_all_yardsticks_are_those_that_a_bank_at_a_time_gives(rhmc: Rhmc, small: None) -> None:
+    said = rhmc("yardsticks", "all", "--out", "o")
+    lines = [line.split() for line in said.out.splitlines() if line.strip() and "─" not in line]
+    assert lines[0] == ["task", "policy", "coverage", "or", "return", "sem"]
+    tasks = {tuple(line[:-3]) for line in lines[1:]}
+    assert {" ".join(task) for task in tasks} == {"coverage flat, 2 x 5", "coverage flat, 4 x 3", "navigation mpe1, 3"}
+    assert len(lines[1:]) == 2 * 10 + 4
+    for words in (["coverage", "--agents", "2"], ["navigation", "--reward", "mpe1"]):
+        scores = json.loads(rhmc("yardsticks", *words, "--episodes", "4", "--json", "--out", "p").out)
+        score = next(iter(scores["nearest"].values())), scores["nearest"]["sem"]
+        shown = next(x for x in lines if x[0] == words[0] and x[-3] == "nearest")
+        assert shown[-2:] == [f"{x:.2f}" for x in score]
+    both = [pd.read_parquet(f"{folder}/yardsticks.parquet") for folder in ("o", "p")]
+    merged = both[1].merge(both[0], on=["run", "metric"], suffixes=("", "_of_all"))
+    assert len(merged) == len(both[1]) > 40
+    assert (merged["value"] == merged["value_of_all"]).all()
+
+
+def test_all_yardsticks_bring_a_folder_up_to_date(rhmc: Rhmc, small: None) -> None:
+    rhmc("yardsticks", "all", "--out", "o")
+    before = [Path("o", name).read_bytes() for name in ("yardsticks.parquet", "yardsticks.runs.parquet")]
+    rhmc("yardsticks", "navigation", "--reward", "mpe1", "--episodes", "20", "--out", "o", "--policies", "nearest")
+    assert Path("o/yardsticks.parquet").read_bytes() != before[0]
+    rhmc("yardsticks", "all", "--out", "o", "--jobs", "1")
+    assert [Path("o", name).read_bytes() for name in ("yardsticks.parquet", "yardsticks.runs.parquet")] == before
+
+
+def by_hand(profile: str) -> list[list[str]]:
+    """The command lines that `dvc.yaml` had, in pieces."""
+    most, slow = {"paper": ("1000", "300"), "quick": ("300", "60")}[profile]
+    coverage = [
+        [],
+        *(["--agents", n] for n in "2356"),
+        *(["--targets", m] for m in "3467"),
+        ["--preset", "coordinator"],
+    ]
+    found = [["coverage", *changed, "--episodes", most] for changed in coverage]
+    found += [["coverage", *changed, "--policies", "planner", "--episodes", slow] for changed in coverage]
+    return found + [["navigation", *changed, "--episodes", most] for changed in ([], ["--reward", "mpe1"])]
+
+
+@pytest.mark.parametrize("profile", ["paper", "quick"])
+def test_all_yardsticks_are_all(profile: str, rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> None:
+    played: list[tuple[Any, ...]] = []
+
+    def play(env: Any, policies: list[str] | None, episodes: int, seed: int) -> dict[str, Any]:
+        chosen = [name for name in names(env.kind) if name != "planner"] if policies is None else policies
+        played.append((env, tuple(chosen), episodes, seed))
+        return {}
+
+    monkeypatch.setattr("rhmc.yardsticks.yardsticks", play)
+    for words in by_hand(profile):
+        assert rhmc("yardsticks", *words).code == 0
+    found = yardsticks.banks(profile)
+    assert sorted(map(repr, played)) == sorted(repr(tuple(bank)) for bank in found)
+    assert [(bank.env.preset, "planner" in bank.policies) for bank in found[:3] if bank.env.kind == "coverage"] == [
+        ("coordinator", True),
+        ("coordinator", False),
+        ("flat", True),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--out", "o"], "o/yardsticks.parquet: a table, but not one of yardsticks; move it away"),
+        (["--out", "studies/x.yaml"], "--out: studies/x.yaml is not a folder"),
+        (["--out", "p", "--profile", "fast"], "--profile: 'fast' is not allowed; allowed: quick, paper"),
+    ],
+)
+def test_all_yardsticks_are_not_played_for_nothing(
+    words: list[str], said: str, rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipelines.yardsticks.score_banks", None)
+    Path("o").mkdir()
+    pd.DataFrame({"a": [1]}).to_parquet("o/yardsticks.parquet")
+    assert rhmc("yardsticks", "all", *words) == (2, "", said + "\n")
+
+
+def test_a_worker_that_is_killed_writes_nothing(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipelines.yardsticks._play", die)
+    said = rhmc("yardsticks", "all", "--out", "o")
+    assert (said.code, said.out, said.err) == (2, "", KILLED + "\n")
+    assert not Path("o").exists()
+
+
+def die(bank: yardsticks.Bank) -> None:
+    """What a lack of memory does to a worker."""
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 # The rest

@@ -19,8 +19,8 @@ from pipelines.mlflow_tracker import open_existing
 from pipelines.plan import study_card
 from pipelines.run import run_studies
 from pipelines.store import Home
-from tests.pipelines.chaos import WORKER, started_by
-from tests.pipelines.support import CODE, tiny
+from tests.pipelines.chaos import WORKER
+from tests.pipelines.support import CODE, started_by, tiny
 
 pytestmark = pytest.mark.ray
 POINTS = 30

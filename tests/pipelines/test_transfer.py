@@ -1,5 +1,6 @@
 """Policies with other numbers than they were trained with: what is played, and what the table holds."""
 
+import pickle
 from pathlib import Path
 
 import pandas as pd
@@ -11,13 +12,14 @@ from pipelines.evaluation import Bank, Policy, score
 from pipelines.policy import Saved
 from pipelines.store import without_replay
 from pipelines.transfer import TRANSFER, Size, export_transfer, sizes, transfer
+from tests.pipelines.support import jobs_of
 from tests.pipelines.test_evaluation import of_kind, trained
 
 
-def policy(encoder: str = "pairwise") -> Policy:
-    one = of_kind("iql", encoder)
+def policy(encoder: str = "pairwise", kind: str = "iql") -> Policy:
+    one = of_kind(kind, encoder)
     trainer, _ = trained(one)
-    return Policy("IQL", Saved(one, without_replay(trainer.state_dict())["algorithm"]))
+    return Policy(kind.upper(), Saved(one, without_replay(trainer.state_dict())["algorithm"]))
 
 
 def test_one_number_is_changed_at_a_time_and_the_trained_ones_are_played_too() -> None:
@@ -37,6 +39,27 @@ def test_the_table_holds_what_evaluation_says(tmp_path: Path) -> None:
         *_, values = score(one, Bank(episodes=8, agents=int(str(row.agents))))
         assert (row.value, row.sem) == (values["return"], values["return_sem"])
     assert set(table["run"]) == {one.saved.spec.id}
+
+
+def test_several_policies_at_a_time_give_the_same_bytes(tmp_path: Path) -> None:
+    policies = [policy(kind=kind) for kind in ("iql", "qmix", "mappo")]
+    files = []
+    for jobs in (1, 2, 5):
+        rows = list(transfer("tiny", iter(policies), [3], [3], 8, jobs))
+        assert [row[1] for row in rows] == ["IQL"] * 3 + ["QMIX"] * 3 + ["MAPPO"] * 3
+        files.append(export_transfer(rows, tmp_path / str(jobs)).read_bytes())
+    assert files == files[:1] * 3
+
+
+def test_a_policy_under_way_goes_to_another_process_without_its_replay(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = of_kind("iql", "pairwise")
+    trainer, _ = trained(one)
+    given: list[Policy] = []
+    monkeypatch.setattr("pipelines.transfer.side_by_side", lambda function, items, jobs: given.extend(items) or ())
+    whole = trainer.state_dict()["algorithm"]
+    assert list(transfer("tiny", [Policy("IQL", Saved(one, whole))], [3], [], 8)) == []
+    sizes = [len(pickle.dumps(state)) for state in (given[0].saved.algorithm, without_replay(whole), whole)]
+    assert sizes[0] == sizes[1] < sizes[2]
 
 
 def test_a_policy_that_cannot_act_with_them_is_said() -> None:
@@ -60,4 +83,22 @@ def test_bad_numbers_are_one_line(
         cli.main()
     assert left.value.code == 2
     assert capsys.readouterr().err == f"{said}\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_what_another_process_cannot_play_is_one_line(
+    jobs: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    policies, seen = [policy(), policy("mlp")], jobs_of("pipelines.transfer", monkeypatch)
+    monkeypatch.setattr("pipelines.evaluation.of_study", lambda *given: iter(policies))
+    words = ["studies/coverage.yaml", "--agents", "3", "--episodes", "4", "--out", str(tmp_path), "--jobs", jobs]
+    monkeypatch.setattr("sys.argv", ["rhmc", "transfer", *words])
+    with pytest.raises(SystemExit) as left:
+        cli.main()
+    assert left.value.code == 2
+    sizes = "--agents or --targets: iql with encoder 'mlp'"
+    said = f"{sizes} acts only with the numbers that it was trained with; 'pairwise' acts with any\n"
+    assert capfd.readouterr() == ("", said)
+    assert seen == [int(jobs)]
     assert list(tmp_path.iterdir()) == []
