@@ -404,7 +404,7 @@ def command(study: str, profile: str) -> str:
     if study == THEOREM:
         return f"rhmc theorem --out reports/{profile}/runs && {report}"
     if study == YARDSTICKS:
-        return f"rhmc yardsticks coverage --profile {profile} --out reports/{profile}/runs && {report}"
+        return f"rhmc yardsticks all --profile {profile} --out reports/{profile}/runs && {report}"
     file, _, variant = study.partition("@")
     which = f"studies/{file}.yaml --profile {profile}" + (f" --variant {variant}" if variant else "")
     return f"rhmc study run {which} && rhmc export {which} && {report}"
