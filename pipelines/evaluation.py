@@ -127,7 +127,11 @@ def of_study(study: Study, home: Path, arms: Sequence[str] = (), seeds: Sequence
             found = True
             yield Policy(item.card.arm, saved)
     if not found:
-        raise InputError(f"{study.name} ({study.profile}): no such run has a policy yet; `rhmc study run` trains it")
+        without = sum((item.card.arm, item.key) in done for item in plan)
+        reason = "no such run has a policy yet; `rhmc study run` trains it"
+        if without:
+            reason = f"the {without} finished runs came without policies, by `rhmc study export --values-only`"
+        raise InputError(f"{study.name} ({study.profile}): {reason}")
 
 
 def _kept(tracker: Tracker, ref: str, item: Item) -> Saved | None:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import pytest
 from ruamel.yaml import YAML
 
+from pipelines.study import Study
 from rhmc.algorithms import ALGORITHMS
 
 ROOT = Path(__file__).parents[1]
@@ -261,6 +262,16 @@ def test_every_study_is_in_the_pipeline(stages: dict) -> None:
     tables = {f"reports/${{profile}}/runs/{name}{kind}.parquet" for name in studies for kind in ("", ".runs")}
     assert unmatched("dvc.yaml", tables, [next(iter(out)) for out in stage["outs"]]) == []
     assert "studies" in stage["deps"]  # the whole folder, and with it what a study includes
+
+
+QUICK = 5_000_000  # environment steps: some ten minutes of two processors
+
+
+def test_the_quick_profile_stays_quick(stages: dict) -> None:
+    runs = [run.spec for file in stages["vars"]["queue"].split() for run in Study.load(ROOT / file).runs()]
+    steps = {spec.id: spec.trainer.steps for spec in runs}  # what studies share is trained once
+    assert sum(steps.values()) <= QUICK
+    assert {spec.algo.kind for spec in runs} == set(ALGORITHMS)
 
 
 def is_search(path: Path) -> bool:

@@ -9,6 +9,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from pipelines.bundle import Packed, pack, unpack
+from pipelines.errors import InputError
+from pipelines.evaluation import of_study
 from pipelines.export import export_study
 from pipelines.mlflow_tracker import MlflowTracker, open_existing
 from pipelines.plan import items, study_card
@@ -26,7 +28,7 @@ STUDY = tiny(
 
 @pytest.fixture(autouse=True)
 def _code(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in ("bundle", "export"):
+    for module in ("bundle", "export", "evaluation"):
         monkeypatch.setattr(f"pipelines.{module}.fingerprint", lambda: CODE)
 
 
@@ -103,6 +105,13 @@ def test_values_travel_without_policies_and_count_as_finished(here: Path, there:
     assert ends == [2.5, 2.5]
     assert {run.status for run in tracker.recorded()} == {"finished"}
     assert tracker.file(tracker.recorded()[0].ref, "policy.pt", tmp_path) is None
+
+
+def test_who_asks_for_policies_that_did_not_travel_is_told_so(here: Path, there: Path, tmp_path: Path) -> None:
+    pack(STUDY, tmp_path / "b", here, values_only=True)
+    unpack(tmp_path / "b", there)
+    with pytest.raises(InputError, match=r"^tiny \(quick\): the 2 finished runs came without policies"):
+        list(of_study(STUDY, there))
 
 
 def test_a_second_import_adds_nothing_and_keeps_what_got_further(here: Path, there: Path, tmp_path: Path) -> None:
