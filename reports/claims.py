@@ -237,9 +237,11 @@ def c7(see: Evidence) -> Finding:
         raise UntestableError(f"Study {SCALING} has no results for several numbers of sensors.")
     best, means = [], {}
     for count, arms in groups.items():
+        if "RHMC" not in arms:
+            raise UntestableError(f"Study {SCALING} lacks RHMC with {count} sensors.")
         others = see.present(SCALING, (arm for method, arm in arms.items() if method != "RHMC"))
-        if "RHMC" not in arms or not others:
-            raise UntestableError(f"Study {SCALING} lacks RHMC or every other method with {count} sensors.")
+        if not others:
+            raise UntestableError(f"With {count} sensors no other method of study {SCALING} has two finished seeds.")
         ours = see.finals(SCALING, arms["RHMC"])
         best += [difference(ours, see.finals(SCALING, arm)).above(0) for arm in others]
         means[f"RHMC, {count} sensors"] = interval(ours)

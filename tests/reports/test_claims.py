@@ -141,12 +141,12 @@ def test_c6(tmp_path: Path) -> None:
     assert verdict("slow", 70, {"RHMC": 1.0}) == "not reproduced"
 
 
-def sensors(ours: Sequence[float], theirs: Sequence[float]) -> Tables:
-    """RHMC and IQL at 2, 3, ... sensors."""
+def sensors(ours: Sequence[float], theirs: Sequence[float], seeds: tuple[int, int] = (5, 5)) -> Tables:
+    """RHMC and IQL at 2, 3, ... sensors, each with its number of seeds."""
     parts = [
         study(
             "scaling",
-            {f"RHMC, {n} sensors": noisy(x, 5), f"IQL, {n} sensors": noisy(y, 5)},
+            {f"RHMC, {n} sensors": noisy(x, seeds[0]), f"IQL, {n} sensors": noisy(y, seeds[1])},
             env=COVERAGE | {"agents": n},
             steps=PAPER,
         )
@@ -167,6 +167,18 @@ def sensors(ours: Sequence[float], theirs: Sequence[float]) -> Tables:
 )
 def test_c7(tmp_path: Path, ours: Sequence[float], theirs: Sequence[float], verdict: str) -> None:
     assert verdicts(tmp_path, sensors(ours, theirs))["C7"].verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("seeds", "reason"),
+    [
+        ((0, 5), "Study scaling lacks RHMC with 2 sensors."),
+        ((1, 1), "With 2 sensors no other method of study scaling has two finished seeds."),
+    ],
+)
+def test_c7_says_what_is_missing(tmp_path: Path, seeds: tuple[int, int], reason: str) -> None:
+    found = verdicts(tmp_path, sensors([50, 60], [40, 50], seeds))["C7"]
+    assert (found.verdict, found.reason) == ("untestable", reason)
 
 
 @pytest.mark.parametrize(
