@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
@@ -127,6 +128,15 @@ def test_a_caller_with_an_error_of_its_own_does_not_wait_either() -> None:
     assert workers() == []
 
 
+@pytest.fixture
+def _listening() -> Iterator[None]:
+    """Programs that are started listen to Ctrl-C, also where the tests run in the background and do not themselves."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("_listening")
 @pytest.mark.parametrize("at_work", [1.0, 8.0], ids=["while they start", "at work"])  # seconds of processor time
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL], ids=lambda how: how.name)
 def test_nothing_is_left_of_a_command_that_is_stopped(how: signal.Signals, at_work: float, tmp_path: Path) -> None:
@@ -135,21 +145,22 @@ def test_nothing_is_left_of_a_command_that_is_stopped(how: signal.Signals, at_wo
     command = [sys.executable, "-m", "pipelines.cli", "yardsticks", "all", "--profile", "paper", "--out", str(out)]
     with (tmp_path / "said").open("w") as said:
         process = subprocess.Popen(command, cwd=ROOT, stdout=said, stderr=said, start_new_session=True)
-    while not (found := started_by(process.pid, SPAWNED)) or sum(p.cpu_times().user for p in found) < at_work:
-        assert process.poll() is None, (tmp_path / "said").read_text()
-        time.sleep(0.02)
-    if how == signal.SIGINT:
-        os.killpg(process.pid, how)
-    else:
-        process.send_signal(how)
-    assert process.wait(30) == (130 if how == signal.SIGINT else -how)
-    end = time.monotonic() + 30
-    while left := started_by(process.pid):
-        if time.monotonic() > end:
-            for one in left:
-                one.kill()
-            pytest.fail(f"left behind: {left}")
-        time.sleep(0.02)
+    try:
+        while not (found := started_by(process.pid, SPAWNED)) or sum(p.cpu_times().user for p in found) < at_work:
+            assert process.poll() is None, (tmp_path / "said").read_text()
+            time.sleep(0.02)
+        if how == signal.SIGINT:
+            os.killpg(process.pid, how)
+        else:
+            process.send_signal(how)
+        assert process.wait(30) == (130 if how == signal.SIGINT else -how)
+        end = time.monotonic() + 30
+        while (left := started_by(process.pid)) and time.monotonic() < end:
+            time.sleep(0.02)
+        assert left == []
+    finally:
+        for one in started_by(process.pid):
+            one.kill()
     assert not out.exists()
     if how == signal.SIGINT:
         assert (tmp_path / "said").read_text().strip() == ""
