@@ -82,8 +82,9 @@ class Recorder:
 
     def adopt(self, key: str, source: str) -> None:
         """Copy a finished run of another study, if this one waits for the training."""
-        if waiting := self.waiting.pop(key, None):
-            self._copy(source, waiting)
+        if key in self.waiting:
+            self._copy(source, self.waiting[key])
+            del self.waiting[key]
 
     def _copy(self, source: str, items: list[Item]) -> None:
         points = points_of(self.tracker.rows([source])) if items else []
@@ -140,11 +141,12 @@ class Recorder:
             self._finish(key)
 
     def _finish(self, key: str) -> None:
-        log, items, folder = self.logs[key], self.waiting.pop(key), self.home.checkpoints(key)
+        log, items, folder = self.logs[key], self.waiting[key], self.home.checkpoints(key)
         keep(log, folder)
         self._end(key, "finished")
         self.board.end(items[0].name, "finished")
         self._copy(log.ref, items[1:])
+        del self.waiting[key]  # now that nothing of it can fail any more
         Checkpoints(folder).clear()
 
     def placed(self, key: str, node: str) -> None:

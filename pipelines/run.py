@@ -62,8 +62,8 @@ def _apart(studies: Sequence[Study]) -> Iterator[str]:
         if count > 1:
             yield f"{name}: given {count} times; studies that run together need names of their own"
     for study in studies:
-        for field, value in study.resources.model_dump().items():
-            other = getattr(first.resources, field)
+        for field in ("concurrent", "cpus"):
+            value, other = getattr(study.resources, field), getattr(first.resources, field)
             if value != other:
                 yield (
                     f"resources.{field} is {value} in {study.name} and {other} in {first.name}; studies that run "
@@ -201,6 +201,7 @@ def train(studies: Sequence[Study], recorders: Recorders, home: Home, interrupts
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)
     stop = scratch / "stop"
+    every = {study.name: study.resources.checkpoint_every for study in studies}
     plans = [one.plan for one in recorders.each]
     drawn = set().union(*(animated(study, plan) for study, plan in zip(studies, plans, strict=True)))
     jobs = [
@@ -208,7 +209,7 @@ def train(studies: Sequence[Study], recorders: Recorders, home: Home, interrupts
             "key": item.key,
             "spec": item.spec.canonical(),
             "folder": str(home.checkpoints(item.key)),
-            "checkpoint_every": resources.checkpoint_every,
+            "checkpoint_every": every[item.study],
             "stop": str(stop),
             "animate": item.key in drawn,
         }

@@ -124,7 +124,8 @@ class Study(Frozen):
             profile: one of `PROFILES`.
             overrides: `key=value`, key a dotted path of the file (`seeds`, `base.algo.lr`, `arms.full.env.agents`),
                 merged into it as an arm is into the base. `env.`, `algo.` and `trainer.` stand for `base.env.` and so
-                on, and `trainer.steps` for `steps`. They go before a profile's changes; an arm keeps what it states.
+                on, and `trainer.steps` for `steps`. They go before a profile's changes of the base;
+                an arm keeps what it states, or the profile for it.
             variant: one of the file's `variants`; None for the arms as they stand.
 
         Raises:
@@ -349,11 +350,11 @@ def _target(root: Node, key: str) -> list[str]:
         of_profile = i == 2 and parts[0] == "profiles"
         if part == "grid" and (i == 0 or of_profile):  # its keys are dotted themselves
             return [*parts[: i + 1], ".".join(parts[i + 1 :])]
-    names = list(root.children.get("arms", root).children)
-    for name in names if parts[0] == "arms" else []:
+    start = 1 if parts[0] == "arms" else 3 if parts[0] == "profiles" and parts[2:3] == ["changes"] else 0
+    for name in list(root.children.get("arms", root).children) if start else []:
         words = name.split(".")
-        if parts[1 : 1 + len(words)] == words:
-            return ["arms", name, *parts[1 + len(words) :]]
+        if parts[start : start + len(words)] == words:
+            return [*parts[:start], name, *parts[start + len(words) :]]
     return parts
 
 
@@ -421,7 +422,8 @@ def _changed(
     faults = [fault for name, arm in arms.items() for fault in _name_faults(name, arm)]
     changes = _group(profile, "changes") if profile else {}
     unknown = {name: node for name, node in changes.items() if name not in arms}
-    faults += [Fault(n.key, n.path, f"{show(name)} is no arm; {choices(name, arms)}") for name, n in unknown.items()]
+    allowed = {name: choices(name, arms) if arms else "this study has none, but a grid" for name in unknown}
+    faults += [Fault(n.key, n.path, f"{show(name)} is no arm; {allowed[name]}") for name, n in unknown.items()]
     layers = [changes, *(_group(patch, "arms") for patch in patches)] if changes else []
     changed = {name: [layer[name] for layer in layers if name in layer] for name in arms if name in changes}
     return {name: reduce(merge, changed.get(name, []), arm) for name, arm in arms.items()}, faults

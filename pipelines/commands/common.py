@@ -2,7 +2,8 @@
 
 import json
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,7 +22,8 @@ SET_HELP = (
     "Change the study: KEY=VALUE, KEY a dotted path of its file, VALUE read as YAML (seeds=1, steps=1e5, "
     "base.algo.lr=1e-3, arms.full.env.agents=6, grid.algo.alpha=[0,0.1]). env., algo. and trainer. stand for "
     "base.env., base.algo. and base.trainer., and trainer.steps for steps. Merged as an arm is into the base. It goes "
-    "before what a profile changes; an arm keeps what it states itself. Can be given several times."
+    "before what a profile changes in the base; an arm keeps what it states itself, or the profile for it. Can be "
+    "given several times."
 )
 
 
@@ -67,15 +69,28 @@ def load_studies(
     Raises:
         InputError: with every fault of all of them.
     """
-    studies, faults = [], []
+    studies: list[Study] = []
+    faults: dict[Path, list[str]] = {}
     for file in files:
         try:
             studies.append(load_study(file, profile, overrides, variant))
         except InputError as error:
-            faults += str(error).splitlines()
+            faults[file] = str(error).splitlines()
     if faults:
-        raise InputError("\n".join(dict.fromkeys(faults)))  # a fault of an option is the same for each
+        raise InputError("\n".join(_of_files(faults, len(set(files)))))
     return studies
+
+
+def _of_files(faults: Mapping[Path, Sequence[str]], files: int) -> list[str]:
+    """The faults of several files: one of an option is said once if all have it, else it names the file."""
+    counts = Counter(line for lines in faults.values() for line in lines)
+    return list(
+        dict.fromkeys(
+            f"{file}: {line}" if line.startswith("--") and counts[line] < files else line
+            for file, lines in faults.items()
+            for line in lines
+        )
+    )
 
 
 @contextmanager

@@ -273,8 +273,17 @@ def test_what_is_wrong_with_several_studies_is_said_at_once(rhmc: Rhmc, tmp_path
     said = rhmc("study", "run", "studies/x.yaml", "studies/y.yaml", "studies/z.yaml", "--set", "seed=1")
     lines = said.err.splitlines()
     assert said.code == 2
-    assert [line.partition(":")[0] for line in lines] == ["--set seed=1", "studies/y.yaml", "studies/z.yaml"]
+    assert [line.partition(":")[0] for line in lines] == [f"studies/{name}.yaml" for name in "xyyz"]
     assert not (tmp_path / "work").exists()
+
+
+def test_what_is_wrong_with_an_option_names_the_study_unless_it_is_wrong_for_all(rhmc: Rhmc) -> None:
+    Path("studies/y.yaml").write_text(STUDY + "variants: {large: {algo: {hidden: 128}}}\n")
+    words = ["studies/x.yaml", "studies/y.yaml"]
+    said = rhmc("study", "run", *words, "--variant", "large")
+    assert said == (2, "", "studies/x.yaml: --variant: 'large' is not allowed; this study has no variants\n")
+    said = rhmc("study", "run", *words, "--profile", "quik")
+    assert (said.code, said.err.count("\n"), said.err[:10]) == (2, 1, "--profile:")
 
 
 def test_studies_that_cannot_run_together(rhmc: Rhmc, tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from pipelines.recorders import Recorders
 from pipelines.run import run_studies
 from pipelines.store import Home, StoreError
 from pipelines.study import Study
-from pipelines.tracker import MemoryRun, MemoryTracker, points_of
+from pipelines.tracker import MemoryRun, MemoryTracker, StudyCard, points_of
 from tests.pipelines.chaos import fit_here
 from tests.pipelines.support import plan, setting, tiny
 
@@ -97,34 +97,93 @@ def test_the_logs_under_way_are_those_of_all(both: Recorders) -> None:
     assert [one.status for one in both.each] == ["interrupted", "failed"]
 
 
-def test_what_failed_for_one_study_is_tried_for_the_next_and_then_left(both: Recorders) -> None:
+def test_what_failed_for_one_study_failed_for_the_other_and_is_not_tried_again(
+    both: Recorders, shelf: list[MemoryRun]
+) -> None:
     slow, fast, faster = (item.key for item in both.todo())
     train(both, fast)
     train(both, faster)
-    both.failed(slow, "boom", "Traceback")
-    assert both.again()
-    assert [item.name for item in both.todo()] == ["second / as slow s0"]
-    both.failed(slow, "boom", "Traceback")
-    assert not both.again()
-    assert [one.status for one in both.each] == ["failed", "failed"]
-
-
-def test_what_was_out_of_reach_is_asked_for_again_by_the_same_study(both: Recorders) -> None:
-    slow, fast, faster = (item.key for item in both.todo())
-    train(both, fast)
     both.start(slow)
-    both.lost(slow)
+    both.result(slow, {"done": True, "stopped": False, "points": [], "error": "boom", "trace": "Traceback"})
+    assert [one.failures for one in both.each] == [{"first / slow s0": "boom"}, {"second / as slow s0": "boom"}]
+    assert [(run.status, run.tags["error"]) for run in shelf if run.card.key == slow] == [("failed", "boom")] * 2
+    assert [one.status for one in both.each] == ["failed", "failed"]
+    assert both.todo() == []
+    assert not both.again()
+
+
+def test_a_worker_that_died_for_good_failed_for_both(both: Recorders) -> None:
+    slow = both.todo()[0].key
+    both.failed(slow, "its worker died", "Traceback")  # before it told anything
+    assert [list(one.failures) for one in both.each] == [["first / slow s0"], ["second / as slow s0"]]
+
+
+def test_what_another_process_trains_is_waited_for_by_the_same_study(both: Recorders) -> None:
+    _, fast, faster = (item.key for item in both.todo())
+    train(both, fast)
     both.start(faster)
-    both.placed(faster, "host (a)")
     both.died(faster)
     both.start(faster)
     both.result(faster, {"done": True, "stopped": True, "busy": True, "points": []})
     assert both.again()
     assert [item.name for item in both.todo()] == ["first / slow s0", "second / faster s0"]
+    assert not both.again()  # asked for once
+
+
+def test_what_its_node_took_along_is_trained_once_more(both: Recorders, shelf: list[MemoryRun]) -> None:
+    slow = both.todo()[0].key
+    both.start(slow)
+    both.placed(slow, "host (a)")
+    both.lost(slow)
+    assert (shelf[0].tags["nodes"], shelf[0].status) == ("host (a)", "interrupted")
+    assert both.again()
+    assert both.todo()[0].key == slow
+
+
+def test_what_another_process_finished_meanwhile_is_copied(both: Recorders, shelf: list[MemoryRun]) -> None:
+    slow, fast, faster = (item.key for item in both.todo())
+    train(both, fast)
+    train(both, faster)
+    both.start(slow)
+    both.result(slow, {"done": True, "stopped": True, "busy": True, "points": []})
+    elsewhere = StudyCard("elsewhere", "quick", "")
+    theirs = MemoryTracker(elsewhere, shelf).start(both.each[0].todo()[0].card)
+    theirs.log(POINTS)
+    theirs.finish("finished")
+    assert not both.again()
+    assert [one.status for one in both.each] == ["finished", "finished"]
+
+
+def test_a_run_is_finished_once_all_of_it_is_kept(both: Recorders, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise StoreError("the disk is full")
+
+    for item in both.todo()[1:]:
+        train(both, item.key)
+    monkeypatch.setattr("pipelines.recorder.keep", full)
+    with pytest.raises(StoreError):
+        train(both, both.todo()[0].key)
+    assert [one.status for one in both.each] == ["interrupted", "interrupted"]
+
+
+def test_a_run_that_could_not_be_copied_is_not_finished(both: Recorders, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise StoreError("the disk is full")
+
+    for item in both.todo()[1:]:
+        train(both, item.key)
+    monkeypatch.setattr(both.each[1], "_copy", full)
+    with pytest.raises(StoreError):
+        train(both, both.todo()[0].key)
+    assert [one.status for one in both.each] == ["finished", "interrupted"]
+
+
+def with_resources(study: Study, **changes: Any) -> Study:
+    return study.model_copy(update={"resources": study.resources.model_copy(update=changes)})
 
 
 def test_studies_that_share_workers_or_names_wrongly_are_refused(tmp_path: Path) -> None:
-    alone = SECOND.model_copy(update={"resources": SECOND.resources.model_copy(update={"cpus": 2})})
+    alone = with_resources(SECOND, cpus=2)
     with pytest.raises(InputError, match=r"^resources\.cpus is 2 in second and 1 in first; studies that run together"):
         run_studies([FIRST, alone], tmp_path)
     with pytest.raises(InputError, match=r"^first: given 2 times"):
@@ -136,13 +195,20 @@ def test_studies_that_share_workers_or_names_wrongly_are_refused(tmp_path: Path)
 
 
 @pytest.fixture
-def here(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+def jobs() -> list[Any]:
+    """All that were handed out."""
+    return []
+
+
+@pytest.fixture
+def here(jobs: list[Any], monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     """Trains in this process; the keys of each round."""
     rounds = []
 
-    def fit(jobs: list[dict[str, Any]], *rest: Any) -> None:
-        rounds.append([job["key"] for job in jobs])
-        fit_here(jobs, *rest)
+    def fit(given: list[dict[str, Any]], *rest: Any) -> None:
+        rounds.append([job["key"] for job in given])
+        jobs.extend(given)
+        fit_here(given, *rest)
 
     monkeypatch.setattr(ray_driver, "fit", fit)
     monkeypatch.setattr(ray_driver, "ray_session", lambda *args: nullcontext([]))
@@ -171,6 +237,33 @@ def test_a_launch_of_two_studies(home: Path, here: list[list[str]], capsys: pyte
     assert run_studies([SECOND, FIRST], home) == 0
     assert "4 of 4 runs were finished before" in capsys.readouterr().out
     assert len(here) == 1
+
+
+def test_each_study_has_its_own_checkpoints_and_animations(home: Path, here: list[list[str]], jobs: list[Any]) -> None:
+    studies = [with_resources(FIRST, animate="none"), with_resources(SECOND, animate="first", checkpoint_every=7)]
+    assert run_studies(studies, home) == 0
+    assert [(job["animate"], job["checkpoint_every"]) for job in jobs] == [(True, 2), (False, 2), (True, 7)]
+
+
+def test_the_locks_are_taken_in_one_order(home: Path, here: list[list[str]], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two launches of the same studies in another order would else wait for one another."""
+    taken, lock = [], Home.lock
+    monkeypatch.setattr(Home, "lock", lambda self, *names: taken.append(names[0]) or lock(self, *names))
+    assert run_studies([SECOND, FIRST], home) == 0
+    assert taken == ["first", "second"]
+
+
+def test_a_failure_of_the_second_study_is_one_of_the_launch(
+    home: Path, here: list[list[str]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    blocked = Home(home).checkpoints(f"{SECOND.runs()[1].spec.id}-{fingerprint()}")
+    blocked.parent.mkdir(parents=True)
+    blocked.touch()  # a file where the checkpoints should go
+    assert run_studies([FIRST, SECOND], home) == 1
+    said = capsys.readouterr().out
+    assert "failed: second / faster s0: " in said
+    assert said.endswith("rhmc study run studies/first.yaml studies/second.yaml --profile quick   (continues)\n")
+    assert (statuses(FIRST, home)[0], statuses(SECOND, home)[0]) == ("FINISHED", "FAILED")
 
 
 def test_a_study_that_is_driven_elsewhere_holds_up_the_launch(

@@ -81,6 +81,15 @@ def test_a_profile_changes_single_arms() -> None:
     over = load(text, "quick", "arms.IQL.algo.lr=0.25")
     assert (over.arms["IQL"].algo.lr, over.arms["IQL"].env.agents) == (0.25, 3)
     assert load(text, "quick", "profiles.quick.changes.IQL.algo.lr=0.125").arms["IQL"].algo.lr == 0.125
+    dotted = load(text.replace("IQL", "a.b"), "quick", "profiles.quick.changes.a.b.algo.lr=0.125")
+    assert dotted.arms["a.b"].algo.lr == 0.125
+    assert load(text, "quick", "base.env.agents=2").arms["IQL"].env.agents == 3
+
+
+def test_changes_of_a_study_that_has_only_a_grid_are_refused() -> None:
+    text = GRID.replace(GRID[GRID.index("arms:") : GRID.index("grid:")], "")
+    said = faults(text + "profiles: {quick: {changes: {IQL: {algo: {lr: 0.5}}}}}\n")
+    assert [line.partition("changes.IQL: ")[2] for line in said] == ["'IQL' is no arm; this study has none, but a grid"]
 
 
 def test_profiles_choose_seeds_steps_and_the_trainer() -> None:
