@@ -240,6 +240,21 @@ def test_arms_that_are_the_same_run_are_trained_once(launch: Launch, shelf: list
     assert shelf[1].tags["reused_from"] == shelf[0].ref
 
 
+def test_a_study_whose_twin_could_not_be_copied_is_not_finished(
+    launch: Launch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise StoreError("the disk is full")
+
+    run = plan()[0]
+    recorder = launch([run, run._replace(card=run.card._replace(arm="twin"))])
+    monkeypatch.setattr(recorder, "_copy", full)
+    step(recorder, run.key)
+    with pytest.raises(StoreError):
+        finish(recorder, run.key)
+    assert recorder.status == "interrupted"
+
+
 def test_what_another_study_finished_is_copied(launch: Launch, shelf: list[MemoryRun]) -> None:
     other = launch(study=STUDY._replace(study="other"))
     key = other.todo()[0].key
