@@ -17,6 +17,7 @@ from pipelines.study import RunSpec, Study, changes
 from pipelines.tracker import Card, Recorded, StudyCard
 
 LISTED = 25  # arms that a description names: MLflow keeps 8,000 characters of one
+RESULTS = (":(top,exclude)dvc.lock", ":(top,exclude,glob)reports/*/**")  # of the pipeline, as git's pathspecs
 KIND = "algo.kind"  # which is what the param `method` says
 
 
@@ -141,12 +142,22 @@ def _lists_on_a_line(tree: Any) -> Any:
     return line
 
 
-def commit() -> str:
-    """The commit of the code, with `-dirty` where files differ from it; `unknown` outside a repository."""
-    here = Path(__file__).parent
+def commit(where: Path = Path(__file__).parent) -> str:
+    """The commit of the code, with `-dirty` where files differ from it; `unknown` outside a repository.
+
+    Results are not looked at: `dvc repro` writes its lock and the report's tables after every stage.
+
+    Args:
+        where: a folder of the repository.
+    """
     try:
-        command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
-        done = subprocess.run(command, cwd=here, capture_output=True, text=True, timeout=10, check=True)
+        name = _git(where, "rev-parse", "HEAD")
+        changed = _git(where, "status", "--porcelain", "--untracked-files=no", "--", ":/", *RESULTS)
     except (OSError, subprocess.SubprocessError):
         return "unknown"
-    return done.stdout.strip() or "unknown"
+    return f"{name}-dirty" if changed else name
+
+
+def _git(where: Path, *words: str) -> str:
+    done = subprocess.run(["git", *words], cwd=where, capture_output=True, text=True, timeout=10, check=True)
+    return done.stdout.strip()

@@ -4,6 +4,7 @@ import fcntl
 import io
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -26,7 +27,7 @@ from pipelines import progress, ray_driver, run, trainable
 from pipelines.export import export_study
 from pipelines.fingerprint import fingerprint
 from pipelines.mlflow_tracker import MlflowTracker, open_existing
-from pipelines.plan import Item, items, study_card, what_varies
+from pipelines.plan import Item, commit, items, study_card, what_varies
 from pipelines.progress import LiveBoard, PlainBoard, duration
 from pipelines.ray_driver import sockets
 from pipelines.recorder import Recorder
@@ -656,6 +657,29 @@ def test_a_run_that_is_stopped_before_it_begins_has_not_failed(
     (alone,) = recorder.each
     assert (alone.failures, alone.left) == ({}, 2)
     assert not list(home.rglob("*.pt"))
+
+
+def test_a_commit_is_dirty_by_code_and_not_by_results(tmp_path: Path) -> None:
+    def git(*words: str) -> None:
+        names = ("-c", "user.name=n", "-c", "user.email=e")
+        subprocess.run(["git", *names, *words], cwd=tmp_path, check=True, capture_output=True)
+
+    files = [tmp_path / name for name in ("rhmc/a.py", "reports/page.py", "reports/paper/claims.md", "dvc.lock")]
+    for file in files:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text("one\n")
+    assert commit(tmp_path) == "unknown"
+    git("init", "-q")
+    git("add", ".")
+    git("commit", "-qm", "x")
+    clean = commit(tmp_path / "rhmc")
+    assert re.fullmatch("[0-9a-f]{40}", clean)
+    found = []
+    for file in files:
+        file.write_text("two\n")
+        found.append(commit(tmp_path / "rhmc"))
+        file.write_text("one\n")
+    assert found == [f"{clean}-dirty", f"{clean}-dirty", clean, clean]
 
 
 def test_a_setting_that_one_method_lacks_does_not_vary_for_that() -> None:
