@@ -16,7 +16,7 @@ from rich.console import Console
 
 from pipelines.errors import InputError
 from pipelines.fingerprint import fingerprint
-from pipelines.host import host
+from pipelines.host import Host, host
 from pipelines.plan import Item, commit, finished, items, study_card
 from pipelines.progress import Board, board, print_table
 from pipelines.ray_settings import set_up_ray
@@ -143,6 +143,14 @@ class Interrupts:
             raise KeyboardInterrupt from error
 
 
+class Code(NamedTuple):
+    """What a launch runs, and where: the same for all of its studies."""
+
+    fingerprint: str
+    commit: str
+    host: Host
+
+
 class Launched(NamedTuple):
     """A study with its log and what keeps that in step."""
 
@@ -153,7 +161,8 @@ class Launched(NamedTuple):
 
 def _launch(studies: Sequence[Study], home: Home, interrupts: Interrupts) -> int:
     with board(Console()) as display, ExitStack() as logs:
-        launched = [logs.enter_context(_logged(study, home, display)) for study in studies]
+        code = Code(fingerprint(), commit(), host())
+        launched = [logs.enter_context(_logged(study, code, home, display)) for study in studies]
         recorders = Recorders([one.recorder for one in launched])
         if skipped := sum(one.skipped for one in recorders.each):
             display.say(f"{skipped} of {sum(len(one.plan) for one in recorders.each)} runs were finished before")
@@ -169,7 +178,7 @@ def _launch(studies: Sequence[Study], home: Home, interrupts: Interrupts) -> int
 
 
 @contextmanager
-def _logged(study: Study, home: Home, display: Board) -> Iterator[Launched]:
+def _logged(study: Study, code: Code, home: Home, display: Board) -> Iterator[Launched]:
     """A study's log while it is written to; whatever happens, it ends with how far the study came."""
     from pipelines.mlflow_tracker import MlflowTracker  # 3 s: only when something is launched
 
@@ -177,7 +186,7 @@ def _logged(study: Study, home: Home, display: Board) -> Iterator[Launched]:
     tracker = MlflowTracker(card, home)
     recorder = None
     try:
-        recorder = Recorder(card, items(study, fingerprint(), commit(), host()), tracker, home, display)
+        recorder = Recorder(card, items(study, *code), tracker, home, display)
         yield Launched(study, tracker, recorder)
     finally:
         tracker.close(recorder.status if recorder else "interrupted")

@@ -21,6 +21,7 @@ import psutil
 import psycopg
 
 from tests.pipelines.chaos import free_port
+from tests.pipelines.support import started_by
 
 ROOT = Path(__file__).parents[2]
 PATIENCE = 180.0  # seconds for a program to answer, on a busy machine
@@ -41,19 +42,9 @@ def postgres_programs() -> Path | None:
     return next((one for one in found if (one / "initdb").exists() and (one / "postgres").exists()), None)
 
 
-def session(leader: int, name: str = "") -> list[psutil.Process]:
-    """What runs in the session of a process, which may be gone, and has `name` in its command line."""
-    found = []
-    for process in psutil.process_iter():
-        with suppress(psutil.Error, OSError):
-            if os.getsid(process.pid) == leader and process.status() != psutil.STATUS_ZOMBIE:
-                found += [process] if name in " ".join(process.cmdline()) else []
-    return found
-
-
 def kill(leader: int) -> None:
     """Kill -9 all of a session, again until nothing is left."""
-    while left := session(leader):
+    while left := started_by(leader):
         for process in left:
             with suppress(psutil.Error):
                 process.kill()
@@ -150,7 +141,7 @@ class Node:
 
     def __init__(self, process: subprocess.Popen[bytes]) -> None:
         self.process = process
-        (raylet,) = session(process.pid, "raylet/raylet")
+        (raylet,) = started_by(process.pid, "raylet/raylet")
         (self.id,) = (word.partition("=")[2] for word in raylet.cmdline() if word.startswith("--node_id="))
 
     def trained(self, place: str) -> bool:

@@ -44,6 +44,10 @@ def both(shelf: list[MemoryRun], tmp_path: Path) -> Recorders:
     return Recorders([one(FIRST), one(SECOND)])
 
 
+def full(*_: object) -> None:
+    raise StoreError("the disk is full")
+
+
 def train(together: Recorders, key: str) -> None:
     """A training from its start to its end."""
     together.start(key)
@@ -155,9 +159,6 @@ def test_what_another_process_finished_meanwhile_is_copied(both: Recorders, shel
 
 
 def test_a_run_is_finished_once_all_of_it_is_kept(both: Recorders, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> None:
-        raise StoreError("the disk is full")
-
     for item in both.todo()[1:]:
         train(both, item.key)
     monkeypatch.setattr("pipelines.recorder.keep", full)
@@ -167,9 +168,6 @@ def test_a_run_is_finished_once_all_of_it_is_kept(both: Recorders, monkeypatch: 
 
 
 def test_a_run_that_could_not_be_copied_is_not_finished(both: Recorders, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> None:
-        raise StoreError("the disk is full")
-
     for item in both.todo()[1:]:
         train(both, item.key)
     monkeypatch.setattr(both.each[1], "_copy", full)
