@@ -12,7 +12,7 @@ from pipelines.document import Node, Place, validate
 from pipelines.errors import InputError
 from pipelines.fingerprint import fingerprint
 from pipelines.plan import Item, chosen, study_card
-from pipelines.policy import CONFIG, FILE, Actor, Saved, load, settings
+from pipelines.policy import CONFIG, FILE, Actor, NoPolicyError, Saved, load, settings
 from pipelines.store import Home
 from pipelines.study import Study
 from pipelines.tracker import Tracker
@@ -140,13 +140,13 @@ def _kept(tracker: Tracker, ref: str, item: Item) -> Saved | None:
         file = tracker.file(ref, FILE, Path(folder))
         try:
             return load(file, item.spec) if file else None
-        except InputError as error:
+        except NoPolicyError as error:
             raise InputError(f"{item.name}: the {FILE} that its run {ref} keeps is damaged") from error
 
 
 def _begun(home: Home, item: Item) -> Saved | None:
     """That of a run under way, which may be training meanwhile."""
-    with suppress(InputError):
+    with suppress(NoPolicyError):
         return load(home.checkpoints(item.key), item.spec)
     return None
 

@@ -14,7 +14,7 @@ from pipelines.errors import InputError
 from pipelines.fingerprint import fingerprint
 from pipelines.host import Host
 from pipelines.plan import Item, items, study_card
-from pipelines.store import Home, StoreError, whole, work_folder
+from pipelines.store import Home, StoreError, lacks_memory, reason, whole, work_folder
 from pipelines.study import Study
 from pipelines.tracker import Recorded, Row, Tracker
 
@@ -35,7 +35,7 @@ RUNS = pa.schema(
         ("arm", pa.string()),
         ("seed", pa.int64()),
         ("run", pa.string()),
-        ("status", pa.string()),  # finished, partial or missing
+        ("status", pa.string()),  # finished, failed, partial or missing
         ("algorithm", pa.string()),
         ("task", pa.string()),
         ("profile", pa.string()),
@@ -97,7 +97,7 @@ def write_tables(study: Study, plan: list[Item], tracker: Tracker | None, out: P
 
 
 def _about(study: Study, item: Item, run: Recorded | None, rows: list[Row]) -> tuple[str | float, ...]:
-    status = "missing" if run is None else "finished" if run.status == "finished" else "partial"
+    status = "missing" if run is None else run.status if run.status in ("finished", "failed") else "partial"
     seconds = max((row.value for row in rows if row.metric == "time/seconds"), default=0.0)
     card, commit = item.card, run.commit if run else ""
     names = (status, card.algorithm, card.task, study.profile, item.spec.canonical(), card.fingerprint, commit)
@@ -126,12 +126,15 @@ def read_parquet(path: Path, schema: pa.Schema, what: str) -> list[dict[str, Any
 
     Raises:
         InputError: another file has the name.
+        StoreError: it cannot be read.
     """
     if not path.exists():
         return []
     try:
         table = pq.read_table(path)
     except (OSError, pa.ArrowException) as error:
+        if lacks_memory(error) or getattr(error, "errno", None):  # which says nothing of the table
+            raise StoreError(f"{path}: cannot be read now: {reason(error)}") from error
         raise InputError(f"{path}: not a readable table; move it away") from error
     if table.schema.names != schema.names:
         raise InputError(f"{path}: a table, but not one of {what}; move it away")

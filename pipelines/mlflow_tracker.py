@@ -519,7 +519,7 @@ def _recorded(ref: str, status: str, tags: Mapping[str, str]) -> Recorded:
     known: dict[str, str] = defaultdict(str, tags)
     key = f"{known['spec']}-{known['fingerprint']}"
     stale, host = views.STALE in tags, Host(known["machine"], known["versions"])
-    return Recorded(ref, known["variant"], key, FROM_MLFLOW[status], known["commit"], stale, host)
+    return Recorded(ref, known["variant"], key, FROM_MLFLOW[status], known["commit"], stale, host, known["error"])
 
 
 # What may be in the way

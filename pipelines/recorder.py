@@ -13,6 +13,7 @@ from pipelines.render import EPISODE, WHY_NOT
 from pipelines.store import Checkpoints, Home
 from pipelines.tracker import Recorded, RunLog, Status, StudyCard, Tracker, points_of
 from rhmc.trainer import grid_step
+from rhmc.types import Metrics
 
 EXTRAS = (EPISODE, WHY_NOT)  # what a training may leave beside its policy
 
@@ -122,15 +123,13 @@ class Recorder:
         return grid_step(item.spec.trainer, points - 1) if points else 0
 
     def result(self, key: str, result: dict[str, Any]) -> None:
-        """New points of a training; the last ones finish its run."""
+        """New points of a training; the last ones finish its run, or tell that it failed."""
+        if points := result["points"]:
+            self._points(key, points)
+        item = self.waiting[key][0]
         if error := result.get("error"):
             self.failed(key, error, result["trace"])
-            return
-        item, points = self.waiting[key][0], result["points"]
-        self.logs[key].log(points)
-        self.board.points(item.name, points)
-        self.overview.points(item.card.arm, key, points)
-        if result["stopped"]:
+        elif result["stopped"]:
             self._end(key, "interrupted")
             if result.get("busy"):
                 self.busy = True
@@ -139,6 +138,12 @@ class Recorder:
                 self.board.end(item.name, "stopped; the next launch continues it")
         elif result["done"]:
             self._finish(key)
+
+    def _points(self, key: str, points: list[Metrics]) -> None:
+        item = self.waiting[key][0]
+        self.logs[key].log(points)
+        self.board.points(item.name, points)
+        self.overview.points(item.card.arm, key, points)
 
     def _finish(self, key: str) -> None:
         log, items, folder = self.logs[key], self.waiting[key], self.home.checkpoints(key)

@@ -300,25 +300,29 @@ STATES = ("finished", "running", "interrupted", "failed", "missing")
 
 
 def show_status(study: Study, home: Path, *, as_json: bool = False) -> int:
-    """Print how far a study is: per arm the runs finished, under way, failed, missing, and stale (of other code).
+    """Print how far a study is: per arm the runs finished, under way, failed (and why), missing, and stale.
 
     Returns:
         0 all finished, 1 not, 2 something is in the way.
     """
     try:
-        arms, complete = _status(study, Home(home))
+        arms, complete, errors = _status(study, Home(home))
     except StoreError as error:
         print(f"rhmc: {error}", file=sys.stderr)
         return BAD
     if as_json:
-        print(json.dumps({"study": study.name, "profile": study.profile, "finished": complete, "arms": arms}))
+        told = {"study": study.name, "profile": study.profile, "finished": complete, "arms": arms, "errors": errors}
+        print(json.dumps(told))
     else:
         columns = ["planned", *STATES, "stale"]
         print_table(Console(), ["arm", *columns], [[arm, *(str(one[c]) for c in columns)] for arm, one in arms.items()])
+        lines = [f"failed: {name}: {error}" for name, error in errors.items()]
+        Console().print("\n".join(lines), markup=False, highlight=False, soft_wrap=True, end="\n" if lines else "")
     return DONE if complete else FAILED
 
 
-def _status(study: Study, home: Home) -> tuple[dict[str, dict[str, int]], bool]:
+def _status(study: Study, home: Home) -> tuple[dict[str, dict[str, int]], bool, dict[str, str]]:
+    """Counts by arm and state, whether all is finished, and the error of each failed run by its name."""
     from pipelines.mlflow_tracker import open_existing
 
     tracker = open_existing(study_card(study), home)
@@ -334,4 +338,6 @@ def _status(study: Study, home: Home) -> tuple[dict[str, dict[str, int]], bool]:
     for arm, places in _by_arm(plan).items():
         mine = Counter(state.get(place, "missing") for place in places)
         arms[arm] = {"planned": len(places)} | {kind: mine[kind] for kind in STATES} | {"stale": stale[arm]}
-    return arms, planned <= finished(recorded)
+    failed = {(run.arm, run.key): run.error for run in recorded if run.status == "failed"}
+    errors = {item.name: failed[item.card.arm, item.key] for item in plan if (item.card.arm, item.key) in failed}
+    return arms, planned <= finished(recorded), errors

@@ -202,12 +202,10 @@ class Drive:
         if "died" in result:
             self.book.died(one.asked)
             return
-        why = self._points(key, one, result["points"])
-        if why:
-            self._end(key)
-            self.book.prune(key, one.asked, why)
-            one.ledger.prune(one.asked, why)
-            Checkpoints(one.folder).clear()
+        if why := self._points(key, one, result["points"]):
+            self._give_up(key, one, why)
+        elif result.get("diverged"):  # a result of these values: tried again, it would be the same
+            self._give_up(key, one, result["error"], "failed")
         elif result["stopped"]:
             self._end(key)
             self.book.interrupt(key, one.asked)
@@ -216,6 +214,13 @@ class Drive:
             self._complete(key, one, result["points"][-1])
         else:
             self.pool.go_on(key)
+
+    def _give_up(self, key: str, one: Running, why: str, status: Status = "finished") -> None:
+        """Prune a trial; `status` is that of its log."""
+        self._end(key)
+        self.book.prune(key, one.asked, why, status)
+        one.ledger.prune(one.asked, why)
+        Checkpoints(one.folder).clear()
 
     def _points(self, key: str, one: Running, points: Sequence[Metrics]) -> str:
         """Take in points one by one, so that a trial that continues with many is given up where it would have been.
@@ -286,9 +291,11 @@ class Book:
         self.logs[key].log([{"step": step, "objective": value}])
         self._end(key, asked, "complete", "finished", f"objective {value:.2f}")
 
-    def prune(self, key: str, asked: Asked, why: str) -> None:
+    def prune(self, key: str, asked: Asked, why: str, status: Status) -> None:
         """A trial is given up."""
-        self._end(key, asked, "pruned", "finished", f"pruned, {why}")
+        if status == "failed":
+            self.logs[key].tag("error", why)
+        self._end(key, asked, "pruned", status, f"pruned, {why}")
 
     def interrupt(self, key: str, asked: Asked) -> None:
         """A trial saved itself for the next launch."""

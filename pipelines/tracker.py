@@ -61,6 +61,7 @@ class Recorded(NamedTuple):
     commit: str
     stale: bool = False  # marked as no part of the latest plan
     host: Host = Host()
+    error: str = ""  # why it failed, one line
 
 
 class Row(NamedTuple):
@@ -217,7 +218,16 @@ class MemoryTracker:
     def recorded(self) -> list[Recorded]:
         """See `Tracker`."""
         return [
-            Recorded(r.ref, r.card.arm, r.card.key, r.status, r.card.commit, "stale" in r.tags, r.card.host)
+            Recorded(
+                r.ref,
+                r.card.arm,
+                r.card.key,
+                r.status,
+                r.card.commit,
+                "stale" in r.tags,
+                r.card.host,
+                r.tags.get("error", ""),
+            )
             for r in self._mine()
         ]
 

@@ -14,6 +14,7 @@ from filelock import Timeout
 from ray.tune import Trainable
 
 from pipelines.cluster import check_code, here
+from pipelines.health import DivergedError, check, defined
 from pipelines.policy import FILE, SPEC, Saved
 from pipelines.seeds import Seeds
 from pipelines.store import Checkpoints, StoreError, one_line, save_atomically, without_replay
@@ -43,6 +44,8 @@ class RunTrainable(Trainable):
     at the first step of a continued run every point before it as well, so that a log can be made whole. `busy` is true
     where another process is training this run. What goes wrong is a result as well, with `error` (one line) and
     `trace`: were it raised, Ray could not be told to replace a worker that died and to leave alone one that failed.
+    `diverged` is true where a value is not finite: the same settings will come to the same end. The points then end
+    before it.
     """
 
     def setup(self, config: dict[str, Any]) -> None:
@@ -78,6 +81,8 @@ class RunTrainable(Trainable):
             raise  # free now or not: whoever had it may have finished the run, so the driver looks first
         self.trainer = self.make_trainer()
         if state := self.checkpoints.newest():
+            if state.get(SPEC, self.job["spec"]) != self.job["spec"]:
+                raise StoreError(f"{self.checkpoints.folder}: the checkpoints are of another run; move the folder away")
             self.load_state(state)
 
     def make_trainer(self) -> Trainer | Seeds:
@@ -94,6 +99,8 @@ class RunTrainable(Trainable):
             return self.ended
         try:
             return self._step(self.trainer)
+        except DivergedError as error:
+            return failure(error) | {"diverged": True, "points": self.history[self.reported :]}
         except Exception as error:
             return failure(error)
 
@@ -112,7 +119,9 @@ class RunTrainable(Trainable):
         spent = time.perf_counter() - start
         self.seconds += spent
         timing = {"time/seconds": self.seconds, "time/steps_per_second": (trainer.step - before) / spent}
-        self.history.append(metrics | timing)
+        point = defined(metrics)
+        check(point, trainer.state_dict())  # before anything is kept: neither checkpoint nor policy is spoilt
+        self.history.append(point | timing)
 
     def _save(self, trainer: Trainer | Seeds) -> None:
         state = self.state()
@@ -178,5 +187,5 @@ def ending(*, stopped: bool = False, **more: Any) -> dict[str, Any]:
 
 def failure(error: Exception) -> dict[str, Any]:
     """The last result of a run that cannot go on."""
-    line = str(error) if isinstance(error, StoreError) else f"{type(error).__name__}: {one_line(error)}"
+    line = str(error) if isinstance(error, StoreError | DivergedError) else f"{type(error).__name__}: {one_line(error)}"
     return ending(error=line, trace=traceback.format_exc())

@@ -37,7 +37,7 @@ RUNS = (
 )
 TOLD = ("machine", "versions")  # of a run, where they are exported
 METHOD = ("kind", "name", "source", "family", "training", "execution", "critic", "coordination")
-STATUSES = ("finished", "partial", "missing")
+STATUSES = ("finished", "failed", "partial", "missing")
 METHODS = "methods.json"  # what the methods are
 EPISODES = "episode_*.gif"  # animations, one a task
 YARDSTICKS, THEOREM = "yardsticks", "theorem"  # tables that are no studies
@@ -224,7 +224,7 @@ class Results:
             return
         for arm in arms:
             rows = self.plan(study, arm)
-            for status, words in (("missing", "not run"), ("partial", "unfinished")):
+            for status, words in (("missing", "not run"), ("partial", "unfinished"), ("failed", "failed")):
                 seeds = rows.loc[rows["status"] == status, "seed"]
                 if len(seeds):
                     listed = ", ".join(map(str, seeds))

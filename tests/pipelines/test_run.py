@@ -17,6 +17,7 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
 
+import pyarrow.parquet as pq
 import pytest
 import torch
 from filelock import FileLock
@@ -373,6 +374,41 @@ def test_runs_of_a_killed_driver_are_not_said_to_be_running(home: Path, capsys: 
     with Home(home).lock(study.name, study.profile):
         assert (slow()["running"], slow()["interrupted"]) == (1, 0)
     assert (slow()["running"], slow()["interrupted"]) == (0, 1)
+
+
+def test_a_run_that_diverges_looks_failed_everywhere(
+    home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(ray_driver, "ray_session", lambda *args: nullcontext([]))
+    monkeypatch.setattr(ray_driver, "fit", fit_here)
+    study = tiny(arms={"calm": setting(lr=1e-3), "wild": setting(lr=1e6, warmup=0)})
+    assert run_studies([study], home) == 1
+    said = capsys.readouterr().out
+    (line,) = [line for line in said.splitlines() if line.startswith("failed: ")]
+    assert line.startswith("failed: tiny / wild s0: diverged: train/")
+    assert "at step 200; every value must be finite" in line
+    assert re.search(r"wild +0 of 1 +- *$", said, re.MULTILINE)
+
+    assert show_status(study, home) == 1
+    assert line in capsys.readouterr().out.splitlines()
+    assert show_status(study, home, as_json=True) == 1
+    told = json.loads(capsys.readouterr().out)
+    assert (told["arms"]["wild"]["failed"], told["arms"]["wild"]["finished"]) == (1, 0)
+    assert told["errors"] == {"tiny / wild s0": line.removeprefix("failed: tiny / wild s0: ")}
+
+    tracker = open_existing(study_card(study), Home(home))
+    assert tracker is not None
+    wild = next(run for run in tracker.recorded() if run.arm == "wild")
+    kept = {file.path for file in tracker.client.list_artifacts(wild.ref)}
+    assert (wild.status, wild.error, kept) == ("failed", told["errors"]["tiny / wild s0"], {"config.yaml", "error.txt"})
+    assert not list(tracker.client.search_model_versions(f"run_id = '{wild.ref}'"))
+    assert {row.step for row in tracker.rows([wild.ref])} == {0}
+
+    assert export_study(study, home / "out", home) == 1
+    table = pq.read_table(home / "out" / "tiny.runs.parquet").to_pandas().set_index("arm")
+    assert table.status.to_dict() == {"calm": "finished", "wild": "failed"}
+    assert run_studies([study], home) == 1  # the same settings, the same end
+    assert line in capsys.readouterr().out.splitlines()
 
 
 # What may be in the way

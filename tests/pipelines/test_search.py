@@ -23,6 +23,7 @@ from ruamel.yaml import YAML
 
 from pipelines import cli
 from pipelines.found import file_name, winner_yaml
+from pipelines.health import DivergedError
 from pipelines.mlflow_tracker import open_existing
 from pipelines.pool import Failed
 from pipelines.progress import PlainBoard
@@ -33,6 +34,7 @@ from pipelines.seeds import Seeds
 from pipelines.store import Home, StoreError
 from pipelines.study import Setting, Study, StudyError
 from pipelines.tracker import MemoryRun, MemoryTracker, points_of
+from pipelines.trainable import ending
 from pipelines.trials import ATTEMPTS, Ledger, look, open_storage
 from rhmc.trainer import Trainer
 from tests.pipelines.support import CODE, setting
@@ -310,6 +312,8 @@ class Twin:
             curves = {seed: self.shape(Setting.model_validate_json(job["spec"]), seed) for seed in job["seeds"]}
         except ValueError as error:
             return {key: Failed(f"ValueError: {error}", "Traceback")}
+        except DivergedError as error:
+            return {key: ending(error=str(error), trace="Traceback", diverged=True)}
         last = len(next(iter(curves.values()))) - 1
         self.disk[key] = now = min(last, self.disk.get(key, -1) + 1)
         points = [point(curves, k, last) for k in range(self.told[key], now + 1)]
@@ -464,6 +468,28 @@ def test_no_finite_return_ends_a_trial_and_counts(tmp_path: Path) -> None:
         assert whys
         assert set(whys) == {"no finite return at step 600" if ledger.arm == "VDN" else "no finite return at step 200"}
         assert ledger.closed == 5
+
+
+def test_a_trial_that_diverges_is_pruned_and_never_tried_again(tmp_path: Path) -> None:
+    def diverging(one: Setting, seed: int) -> list[float]:
+        if one.algo.lr > 1e-3:
+            raise DivergedError("diverged: train/td_loss is inf at step 200")
+        return curve(one, seed)
+
+    world = World(load(), tmp_path)
+    world.launch(diverging)
+    gone = [t for ledger in world.ledgers() for t in ledger.latest().values() if t.state.name == "PRUNED"]
+    assert gone
+    assert {t.user_attrs["pruned"] for t in gone} == {"diverged: train/td_loss is inf at step 200"}
+    assert all(t.params["lr"] > 1e-3 for t in gone)
+    assert [ledger.closed for ledger in world.ledgers()] == [5, 5]  # the search went on, and is whole
+    assert all(best.params["lr"] <= 1e-3 for ledger in world.ledgers() if (best := ledger.best()))
+    logs = [run for run in world.shelf if run.status == "failed"]
+    assert len(logs) == len(gone)
+    assert {(run.tags["state"], run.tags["error"]) for run in logs} == {
+        ("pruned", "diverged: train/td_loss is inf at step 200")
+    }
+    assert world.launch(diverging).trained == 0
 
 
 def test_a_trial_that_raises_is_tried_in_the_next_launches_and_then_left(tmp_path: Path) -> None:
