@@ -291,7 +291,7 @@ def test_studies_that_cannot_run_together(rhmc: Rhmc, tmp_path: Path) -> None:
     said = rhmc("study", "run", "studies/x.yaml", "studies/y.yaml", "studies/x.yaml")
     twice, shared = said.err.splitlines()
     assert said.code == 2
-    assert twice == "x: given 2 times; studies that run together need names of their own"
+    assert twice == "x: given 2 times; studies that go together need names of their own"
     assert shared.startswith("resources.concurrent is 3 in y and 2 in x; ")
     assert not (tmp_path / "work").exists()
 
