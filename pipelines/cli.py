@@ -71,6 +71,7 @@ app.command("ui", rich_help_panel=RESULTS)(ui.ui)
 app.command("theorem", rich_help_panel=RESULTS)(science.theorem)
 app.command("methods", rich_help_panel=CODE)(science.methods)
 app.command("drawings", rich_help_panel=CODE)(science.drawings)
+app.command("profile", rich_help_panel=CODE)(science.profile)
 app.command("fingerprint", rich_help_panel=CODE)(science.fingerprint)
 app.command("doctor", rich_help_panel=CODE)(doctor.doctor)
 

@@ -5,9 +5,9 @@ from typing import Annotated
 
 import typer
 
-from pipelines.commands.common import Profile, folder_option, profile_faults, table, tell
+from pipelines.commands.common import Profile, folder_option, profile_faults, say, table, tell
 from pipelines.errors import InputError
-from pipelines.names import fault_of_study, simple, study_name
+from pipelines.names import PROFILES, fault_of_study, simple, study_name
 
 
 def theorem(
@@ -57,6 +57,23 @@ def fingerprint(file: Annotated[Path | None, typer.Argument(help="Write it there
             file.write_text(text)
     except OSError as error:
         raise InputError(f"{file}: cannot be written ({error.strerror})") from error
+
+
+def profile(
+    file: Annotated[Path, typer.Argument(help="Where it stands, as `profile: quick`.")] = Path("params.yaml"),
+) -> None:
+    """Print the profile that the pipeline runs on, or say why there is none: its name goes into paths and commands."""
+    from pipelines.document import choices, read, show
+
+    root, faults = read(file)
+    written = root.children.get("profile") if root else None
+    if faults:
+        raise InputError(*map(str, faults))
+    if written is None:
+        raise InputError(f"{file}: profile: missing; {choices('', PROFILES)}")
+    if written.value not in PROFILES:
+        raise InputError(f"{written.place}: profile: {show(written.value)} is not allowed; {choices('', PROFILES)}")
+    say(str(written.value))
 
 
 def drawings(

@@ -90,7 +90,7 @@ VERBS = [
     *([], ["study"], ["study", "run"], ["study", "export"], ["study", "import"], ["yardsticks"], ["evaluate"]),
     *(["yardsticks", "all"], ["transfer"], ["assignments"]),
     *(["search"], ["search", "check"], ["search", "run"], ["search", "status"]),
-    *(["export"], ["report"], ["ui"], ["doctor"]),
+    *(["export"], ["report"], ["ui"], ["doctor"], ["profile"]),
 ]
 
 
