@@ -162,8 +162,9 @@ class _Reader:
             value = self._mapping(node, path) if isinstance(node, MappingNode) else self._sequence(node, path)
         return Node(value, self._place(node), key, path)
 
-    def _mapping(self, node: MappingNode, path: str) -> dict[str, Node]:
+    def _mapping(self, node: MappingNode, path: str) -> dict[str, Node] | Unreadable:
         children: dict[str, Node] = {}
+        whole = True
         for key, child in node.value:
             if not isinstance(key, ScalarNode):
                 self._fault(key, path, "a key must be a word, not a list or a mapping")
@@ -171,6 +172,7 @@ class _Reader:
             name, place = str(key.value), self._place(key)
             if fault := _key_fault(name):
                 self._fault(key, path, fault)
+                whole = False
                 continue
             built = self._build(child, join(path, name), place)
             if name in children:
@@ -179,7 +181,7 @@ class _Reader:
                 self._fault(key, built.path, f"duplicate key {show(name)}, {where}")
             else:
                 children[name] = built
-        return children
+        return children if whole else Unreadable.VALUE
 
     def _sequence(self, node: YamlNode, path: str) -> list[Node]:
         return [self._build(child, join(path, str(i)), self._place(child)) for i, child in enumerate(node.value)]

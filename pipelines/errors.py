@@ -29,6 +29,11 @@ def visible(text: str) -> str:
     return "".join(c if seen(c) else c.encode("unicode_escape").decode() for c in text)
 
 
+def visible_lines(text: str) -> str:
+    """`visible`, but that lines stay lines."""
+    return "\n".join(map(visible, text.split("\n")))
+
+
 def seen(character: str) -> bool:
     """Whether a character shows as itself."""
     return character.isprintable() or unicodedata.category(character) == "Zs"

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipelines.errors import InputError, visible
+from pipelines.errors import InputError, visible, visible_lines
 from pipelines.names import PROFILES
 
 if TYPE_CHECKING:
@@ -120,7 +120,7 @@ def profile_faults(profile: str) -> list[str]:
 
 def say(text: str) -> None:
     """Lines on stdout, at once."""
-    print("\n".join(map(visible, text.split("\n"))), flush=True)
+    print(visible_lines(text), flush=True)
 
 
 def tell(text: str) -> None:

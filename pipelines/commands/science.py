@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from pipelines.commands.common import Profile, folder_option, profile_faults, say, table, tell
-from pipelines.errors import InputError
+from pipelines.errors import InputError, visible_lines
 from pipelines.names import PROFILES, fault_of_study, simple, study_name
 
 
@@ -114,4 +114,4 @@ def report(
     arguments += ["--study", study_name(study, variant or "")] if study else []
     arguments += ["--runs", str(runs)] if runs else []
     arguments += ["--out", str(out)] if out else []
-    raise typer.Exit(build(arguments))
+    raise typer.Exit(build(arguments, visible_lines))
