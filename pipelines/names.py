@@ -23,6 +23,7 @@ RESERVED = {  # what the program itself writes beside the tables of studies, by 
     "modules": "`rhmc drawings`",
     "scenes": "`rhmc drawings`",
 }
+BY_ARM = "_arms"  # ends the name of the figure with a study's curves arm by arm
 STUDY = 80  # bytes of a study's name: with what is put around it a file name keeps below 255
 ARM = 200  # characters of an arm's name
 READABLE = 60  # characters of a slug before its digest
@@ -92,6 +93,8 @@ def fault_of_study(stem: str) -> str:
         return "a study's file is named with letters, digits, '-' and '_' only"
     if stem.startswith("-"):
         return "a study's file is named with no '-' in front, which would make it an option"
+    if stem.endswith(BY_ARM):
+        return f"a study's name does not end in '{BY_ARM}', as a figure of the study '{stem.removesuffix(BY_ARM)}' does"
     if folded(stem) in RESERVED:
         return (
             f"a study cannot be named '{stem}': {RESERVED[folded(stem)]} writes results of that name; rename the file"

@@ -291,7 +291,7 @@ def _sections(report: Report, pictures: Path) -> list[page.Section]:
     of_table |= {name: "ablation" for name in ("table_2",) if name in report.tables}
     whole = [_section(report, pictures, "method", "The method and its tasks", "", ("table_1",))]
     whole += [
-        _section(report, pictures, f"study-{study.replace('@', '-')}", _heading(report.results, study), study, names)
+        _section(report, pictures, f"study-{study.replace('@', '.')}", _heading(report.results, study), study, names)
         for study in studies
         for names in [tuple(name for name, owner in of_table.items() if owner == study)]
     ]

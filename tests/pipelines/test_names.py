@@ -2,7 +2,10 @@
 
 import ast
 import json
+import os
 import re
+import shutil
+import subprocess
 import sys
 import unicodedata
 from collections.abc import Callable
@@ -201,6 +204,7 @@ def tables_in(file: Path) -> set[str]:
     [
         ("b" * 81, f"a name of 81 bytes; at most {STUDY}, for it is part of other names"),
         ("基" * 30, f"a name of 90 bytes; at most {STUDY}, for it is part of other names"),
+        ("x_arms", "a study's name does not end in '_arms', as a figure of the study 'x' does"),
         ("x@letter", "a study's file is named with letters, digits, '-' and '_' only"),
         ("a b", "a study's file is named with letters, digits, '-' and '_' only"),
         ("-x", "a study's file is named with no '-' in front, which would make it an option"),
@@ -507,3 +511,48 @@ def test_the_profile_is_looked_at_before_a_shell_meets_it() -> None:
         if any("${profile}" in line for line in lines):
             assert lines[0] == "rhmc profile", name
     assert "params.yaml" not in (ROOT / "Makefile").read_text(encoding="utf-8").split("help:")[0]
+
+
+@pytest.mark.parametrize("value", ['"; touch pwned; #"', "../../x"])
+def test_dvc_runs_nothing_for_a_profile_that_is_none(value: str, tmp_path: Path) -> None:
+    """The real pipeline, in a folder of its own: before, the shell ran the first of these and made `pwned`."""
+    shutil.copy(ROOT / "dvc.yaml", tmp_path)
+    Path("params.yaml").write_text(f"profile: {value}\n", encoding="utf-8")
+    Path(".fingerprint").touch()
+    tools = Path(sys.executable).parent
+    env = os.environ | {"PATH": f"{tools}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT), "DVC_NO_ANALYTICS": "1"}
+    subprocess.run([tools / "dvc", "init", "-q", "--no-scm"], env=env, check=True, cwd=tmp_path)
+    before = files(tmp_path)
+    done = subprocess.run(
+        [tools / "dvc", "repro", "--single-item", "theorem"],
+        env=env,
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode != 0
+    said = [line for line in done.stderr.splitlines() if line.startswith("params.yaml:")]
+    assert [line.endswith(" is not allowed; allowed: quick, paper") for line in said] == [True]
+    assert files(tmp_path) == before
+
+
+@pytest.mark.parametrize("goal", ["repro", "report"])
+def test_make_runs_nothing_for_a_profile_that_is_none(goal: str, tmp_path: Path) -> None:
+    for name in ("Makefile", "requirements.lock", "pyproject.toml"):
+        shutil.copy(ROOT / name, tmp_path)
+    Path(".venv").mkdir()
+    Path(".venv/.ready").touch()
+    Path("params.yaml").write_text("profile: quick; touch pwned; echo\n", encoding="utf-8")
+    tools = Path(sys.executable).parent
+    env = os.environ | {"PATH": f"{tools}:{os.environ['PATH']}"}
+    done = subprocess.run(["make", goal], env=env, cwd=tmp_path, capture_output=True, text=True, check=False)
+    said = [line for line in done.stderr.splitlines() if not line.startswith("make: ")]
+    assert said == ["params.yaml:1:10: profile: 'quick; touch pwned; echo' is not allowed; allowed: quick, paper"]
+    assert (done.returncode, done.stdout) == (2, "")
+    assert not Path("pwned").exists()
+
+
+def files(folder: Path) -> set[Path]:
+    """All but what DVC notes for itself."""
+    return {path for path in folder.rglob("*") if ".dvc" not in path.parts}
