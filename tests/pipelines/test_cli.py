@@ -328,7 +328,7 @@ def test_an_interrupt_is_130(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> Non
 @pytest.mark.parametrize("options", [["--profile", "paper"], ["--profile", "quick", "--runs", "a", "--out", "b"]])
 def test_report_hands_on_its_options(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch, options: list[str]) -> None:
     calls: list[list[str]] = []
-    build = SimpleNamespace(main=lambda given: calls.append(given) or 2)
+    build = SimpleNamespace(main=lambda given, shown: calls.append(given) or 2)
     monkeypatch.setitem(sys.modules, "reports.build", build)
     assert rhmc("report", *options).code == 2
     assert calls == [options]
