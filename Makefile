@@ -14,7 +14,6 @@ PIP_TORCH_ARGS ?=
 JOBS ?= 2
 KILLS ?= 60
 SEED ?= 0
-PROFILE := $(shell sed -n 's/^profile: *//p' params.yaml)
 IS_311 := -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))'
 PYTHON ?= $(shell for p in python3.11 python3; do $$p $(IS_311) 2>/dev/null && echo $$p && break; done)
 READY := .venv/.ready
@@ -34,9 +33,10 @@ help: ## What there is to make
 setup: $(READY) ## The environment in .venv, exactly as in requirements.lock
 
 repro: $(READY) ## Train, track and report on the profile in params.yaml; an interrupted one continues
+	@rhmc profile > /dev/null
 	@dvc repro || { echo "Not finished. What is done is kept: \`make repro\` continues."; exit 1; }
 	@echo
-	@echo "Report:    reports/$(PROFILE)/index.html"
+	@echo "Report:    reports/$$(rhmc profile)/index.html"
 	@echo "MLflow UI: run \`make ui\` and open the address that it prints"
 
 test: check ## Lint, types and every test
@@ -55,7 +55,7 @@ soak: $(READY) ## Kill drivers, workers and servers of studies again and again; 
 	@python -m tests.pipelines.soak --kills $(KILLS) --seed $(SEED)
 
 report: $(READY) ## The report again, from the exported runs
-	@rhmc report --profile $(PROFILE)
+	@profile=$$(rhmc profile) && rhmc report --profile "$$profile"
 
 ui: $(READY) ## The runs in MLflow's web interface
 	@rhmc ui

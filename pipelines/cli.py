@@ -5,21 +5,53 @@ Everything heavy is imported by the verb that needs it, so that help answers at 
 Exit codes: 0 done, 1 some run failed, 2 bad input (nothing was started), 130 interrupted, 143 terminated.
 """
 
+import errno
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
 
 import typer
+from typer.core import TyperGroup
 
 from pipelines.commands import doctor, evaluate, render, science, search, study, ui, yardsticks
 from pipelines.commands.common import BAD, DONE, INTERRUPTED
-from pipelines.errors import InputError
+from pipelines.errors import InputError, visible
 
 EXIT_CODES = (
     "Exit codes: 0 done; 1 a run failed or is not finished, or something is wrong; 2 bad input, nothing was started; "
     "130 interrupted; 143 terminated. Results are kept in $RHMC_HOME, or in the folder work."
 )
 
+NO_PATH = (errno.ENAMETOOLONG, errno.EACCES, errno.ELOOP)  # what looking at a path says of the path alone
+
+
+class Verbs(TyperGroup):
+    """Shows words that it refuses as messages show them."""
+
+    def make_context(self, *args: Any, **kwargs: Any) -> Any:
+        """The root's own options."""
+        with _visible():
+            return super().make_context(*args, **kwargs)
+
+    def invoke(self, ctx: Any) -> Any:
+        """All else."""
+        with _visible():
+            return super().invoke(ctx)
+
+
+@contextmanager
+def _visible() -> Iterator[None]:
+    try:
+        yield
+    except typer.TyperException as error:
+        error.message = visible(error.message)
+        raise
+
+
 app = typer.Typer(
+    cls=Verbs,
     help="Reproduce a multi-agent coordination paper: run studies, score yardsticks, build the report.",
     epilog=EXIT_CODES,
     no_args_is_help=True,
@@ -39,6 +71,7 @@ app.command("ui", rich_help_panel=RESULTS)(ui.ui)
 app.command("theorem", rich_help_panel=RESULTS)(science.theorem)
 app.command("methods", rich_help_panel=CODE)(science.methods)
 app.command("drawings", rich_help_panel=CODE)(science.drawings)
+app.command("profile", rich_help_panel=CODE)(science.profile)
 app.command("fingerprint", rich_help_panel=CODE)(science.fingerprint)
 app.command("doctor", rich_help_panel=CODE)(doctor.doctor)
 
@@ -55,6 +88,12 @@ def main() -> None:
     except BrokenPipeError:  # the reader of our output has gone, as in `rhmc study list | head -1`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(DONE)
+    except OSError as error:
+        if error.errno not in NO_PATH or error.filename is None:
+            raise
+        limit = "; at most 255 bytes a name, 4,095 a path" if error.errno == errno.ENAMETOOLONG else ""
+        print(InputError(f"{os.fsdecode(error.filename)}: {error.strerror}{limit}"), file=sys.stderr)
+        sys.exit(BAD)
 
 
 if __name__ == "__main__":

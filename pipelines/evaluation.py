@@ -82,7 +82,7 @@ def task(env: EnvConfig, bank: Bank) -> EnvConfig:
         raise InputError("--targets: in navigation there are as many landmarks as agents; give --agents")
     found, faults = validate(ENVS[env.kind][0], _option(fields, env.kind))
     if found is None:
-        raise InputError("\n".join(str(fault) for fault in faults))
+        raise InputError(*map(str, faults))
     return found
 
 

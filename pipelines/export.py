@@ -10,9 +10,10 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipelines.errors import InputError
+from pipelines.errors import InputError, visible
 from pipelines.fingerprint import fingerprint
 from pipelines.host import Host
+from pipelines.origin import another
 from pipelines.plan import Item, items, study_card
 from pipelines.store import Home, StoreError, lacks_memory, reason, whole, work_folder
 from pipelines.study import Study
@@ -65,8 +66,11 @@ def export_study(study: Study, out: Path, home: Path | None = None) -> int:
     """
     from pipelines.mlflow_tracker import open_existing
 
+    place = Home(home or work_folder())
+    if remark := another(place, study.name, study.profile, study.file):
+        print(visible(remark), file=sys.stderr)
     try:
-        tracker = open_existing(study_card(study), Home(home or work_folder()))
+        tracker = open_existing(study_card(study), place)
         plan = items(study, fingerprint(), "")
         unfinished = write_tables(study, plan, tracker, out)
     except StoreError as error:

@@ -13,6 +13,7 @@ from ruamel.yaml.comments import CommentedSeq
 from pipelines.document import choices
 from pipelines.errors import InputError
 from pipelines.host import Host
+from pipelines.names import folded
 from pipelines.study import RunSpec, Study, changes
 from pipelines.tracker import Card, Recorded, StudyCard
 
@@ -62,9 +63,26 @@ def chosen(study: Study, fingerprint: str, arms: Sequence[str] = (), seeds: Sequ
     """
     faults = [f"--arm: '{arm}' is not allowed; {choices(arm, study.arms)}" for arm in arms if arm not in study.arms]
     if faults:
-        raise InputError("\n".join(faults))
+        raise InputError(*faults)
     plan = items(study, fingerprint, "")
     return [i for i in plan if (not arms or i.card.arm in arms) and (not seeds or i.card.seed in seeds)]
+
+
+def given_twice(studies: Sequence[Study]) -> list[str]:
+    """Studies of one name, which would have one experiment and one table."""
+    named: dict[str, list[Study]] = {}
+    for study in studies:
+        named.setdefault(folded(study.name), []).append(study)
+    return [
+        f"{same[0].name}: given {len(same)} times{_files(same)}; studies that go together need names of their own"
+        for same in named.values()
+        if len(same) > 1
+    ]
+
+
+def _files(studies: Sequence[Study]) -> str:
+    files = dict.fromkeys(study.file for study in studies)
+    return f" ({', '.join(files)})" if len(files) > 1 else ""
 
 
 def flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.table import Table
 
+from pipelines.errors import visible
 from rhmc.types import Metrics
 
 EVERY = 10.0  # seconds between two plain lines of a run
@@ -120,7 +121,7 @@ class PlainBoard:
 
     def say(self, text: str) -> None:
         """See `Board`."""
-        self.console.print(text, markup=False, highlight=False, soft_wrap=True)
+        self.console.print(visible(text), markup=False, highlight=False, soft_wrap=True)
 
 
 class LiveBoard:
@@ -174,7 +175,7 @@ class LiveBoard:
 
     def say(self, text: str) -> None:
         """See `Board`."""
-        self.progress.console.print(text, markup=False, highlight=False, soft_wrap=True)
+        self.progress.console.print(visible(text), markup=False, highlight=False, soft_wrap=True)
 
 
 class StopFile:

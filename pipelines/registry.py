@@ -17,6 +17,7 @@ from mlflow.models import Model, ModelSignature
 from mlflow.types import ColSpec, Schema, TensorSpec
 from mlflow.utils.mlflow_tags import MLFLOW_MODEL_VERSIONS
 
+from pipelines.names import PROFILES, slug
 from pipelines.policy import FILE, Saved, load, save, sizes
 from pipelines.study import RunSpec
 from pipelines.tracker import Card, StudyCard
@@ -27,13 +28,15 @@ with warnings.catch_warnings():  # MLflow's own type hints make it warn
     from mlflow.pyfunc import save_model
 
 CODE = Path(__file__).with_name("served.py")
+_PROFILE = re.compile(rf"-({'|'.join(PROFILES)})(-|\Z)")  # what ends the study in a model's name
 REQUIREMENTS = [f"torch=={torch.__version__.partition('+')[0]}", f"numpy=={np.__version__}"]
 
 
 def model_name(study: StudyCard, arm: str) -> str:
-    """The registered name of an arm: what stands in `models:/<name>/<version>`."""
+    """The registered name of an arm: what stands in `models:/<name>/<version>`. No two arms have the same."""
     words = f"{study.study}-{study.profile}-{arm}"
-    return re.sub(r"[^A-Za-z0-9._+-]+", "-", words).strip("-")
+    told = not _PROFILE.search(study.study)  # else it may be read as another study with another arm
+    return slug(words) if told else slug(words, of=f"{study.study}/{study.profile}/{arm}")
 
 
 def register(client: MlflowClient, run: str, experiment: str, study: StudyCard, card: Card, policy: Path) -> None:

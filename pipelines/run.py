@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, NamedTuple, Self
 
 from rich.console import Console
 
-from pipelines.errors import InputError
+from pipelines.errors import InputError, visible
 from pipelines.fingerprint import fingerprint
 from pipelines.host import Host, host
-from pipelines.plan import Item, commit, finished, items, study_card
+from pipelines.origin import another, remember
+from pipelines.plan import Item, commit, finished, given_twice, items, study_card
 from pipelines.progress import Board, board, print_table
 from pipelines.ray_settings import set_up_ray
 from pipelines.recorder import Recorder
@@ -50,7 +51,7 @@ def run_studies(studies: Sequence[Study], home: Path) -> int:
         InputError: the studies cannot be launched together.
     """
     if faults := list(_apart(studies)):
-        raise InputError("\n".join(faults))
+        raise InputError(*faults)
     names = [(study.name, study.profile) for study in studies]
     return guarded(home, names, lambda place, interrupts: _launch(studies, place, interrupts))
 
@@ -58,9 +59,7 @@ def run_studies(studies: Sequence[Study], home: Path) -> int:
 def _apart(studies: Sequence[Study]) -> Iterator[str]:
     """Why studies cannot be launched together."""
     first = studies[0]
-    for name, count in Counter(study.name for study in studies).items():
-        if count > 1:
-            yield f"{name}: given {count} times; studies that run together need names of their own"
+    yield from given_twice(studies)
     for study in studies:
         for field in ("concurrent", "cpus"):
             value, other = getattr(study.resources, field), getattr(first.resources, field)
@@ -161,6 +160,10 @@ class Launched(NamedTuple):
 
 def _launch(studies: Sequence[Study], home: Home, interrupts: Interrupts) -> int:
     with board(Console()) as display, ExitStack() as logs:
+        for study in studies:
+            if remark := another(home, study.name, study.profile, study.file):
+                display.say(remark)
+            remember(home, study.name, study.profile, study.file)
         code = Code(fingerprint(), commit(), host())
         launched = [logs.enter_context(_logged(study, code, home, display)) for study in studies]
         recorders = Recorders([one.recorder for one in launched])
@@ -253,7 +256,7 @@ def _summary(launched: Sequence[Launched]) -> None:
     print_table(console, [*["study"][:several], "arm", "finished", "mean return"], rows)
     for one in launched:
         for name, error in one.recorder.failures.items():
-            console.print(f"failed: {name}: {error}", markup=False, highlight=False, soft_wrap=True)
+            console.print(visible(f"failed: {name}: {error}"), markup=False, highlight=False, soft_wrap=True)
     tracker, left = launched[0].tracker, any(one.recorder.left for one in launched)
     experiments = ", ".join(repr(one.tracker.name) for one in launched)
     lines = [
@@ -262,7 +265,7 @@ def _summary(launched: Sequence[Launched]) -> None:
         f"next:  rhmc {'study run' if left else 'export'} {_arguments([one.study for one in launched])}",
     ]
     lines[-1] += "   (continues)" if left else ""
-    console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+    console.print("\n".join(map(visible, lines)), markup=False, highlight=False, soft_wrap=True)
 
 
 def _arguments(studies: Sequence[Study]) -> str:

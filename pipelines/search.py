@@ -25,6 +25,7 @@ from typing import Any, Literal, NamedTuple, Self, get_args
 from pydantic import Field, model_validator
 
 from pipelines.document import Fault, Node, Place, choices, show, validate
+from pipelines.names import study_name
 from pipelines.study import (
     TABLES,
     TWIN,
@@ -188,7 +189,7 @@ class Search(Frozen):
         file = loaded.file
         counts = {name: getattr(getattr(file, name), profile) for name in COUNTS}
         parts = {name: getattr(file, name) for name in ("sampler", "pruner", "resources")}
-        names = {"name": path.stem, "profile": profile, "file": str(path), "overrides": tuple(overrides)}
+        names = {"name": study_name(path), "profile": profile, "file": str(path), "overrides": tuple(overrides)}
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
         return cls(question=file.question.strip(), arms=arms, sha256=digest, **names, **counts, **parts)
 

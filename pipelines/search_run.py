@@ -18,8 +18,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 from rich.console import Console
 from ruamel.yaml import YAML
 
+from pipelines.errors import visible
 from pipelines.fingerprint import fingerprint
-from pipelines.found import file_name, slug, winner_yaml, write_text
+from pipelines.found import file_name, stem, winner_yaml, write_text
+from pipelines.origin import another, remember
 from pipelines.plan import commit
 from pipelines.progress import Board, StopFile, board, print_table
 from pipelines.ray_settings import set_up_ray
@@ -91,6 +93,9 @@ def _launch(search: Search, home: Home, storage: BaseStorage, out: Path, interru
     status: Status = "interrupted"
     try:
         with explained(url), board(Console()) as display:
+            if remark := another(home, search.name, search.profile, search.file):
+                display.say(remark)
+            remember(home, search.name, search.profile, search.file)
             ledgers = [Ledger(search, arm, code, storage) for arm in search.arms]
             for ledger in ledgers:
                 again = ledger.take_up()
@@ -367,7 +372,7 @@ def results(
     written = Written([], [])
     for ledger in ledgers:
         title = f"{search.name} ({search.profile}): {ledger.arm}"
-        written.plots.extend(plots(ledger.study, title, plots_folder(search, home) / slug(ledger.arm)))
+        written.plots.extend(plots(ledger.study, title, plots_folder(search, home) / stem(ledger.arm)))
         best = ledger.best()
         if out is not None and best is not None:
             file = out / file_name(search, ledger.arm)
@@ -391,7 +396,7 @@ def _summary(
     changes = [word for text in search.overrides for word in ("--set", text)]
     again = shlex.join([search.file, "--profile", search.profile, *changes])
     lines += [] if whole else [f"next:   rhmc search run {again}   (continues)"]
-    console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+    console.print("\n".join(map(visible, lines)), markup=False, highlight=False, soft_wrap=True)
 
 
 HEADER = ["arm", "trials", "complete", "pruned", "running", "waiting", "failed", "missing", "best"]

@@ -5,7 +5,7 @@ import json
 import math
 import shutil
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple, TypeVar
@@ -97,9 +97,14 @@ def build(runs: Path, out: Path, profile: str, study: str | None = None) -> list
     return sorted(path for name in names for path in [out / name, *(out / name).rglob("*")] if path.is_file())
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Build the report of a profile from its exported tables. Returns 0, or 2 if the tables are faulty."""
-    parser = argparse.ArgumentParser(prog="python -m reports.build", description=main.__doc__)
+def main(argv: Sequence[str] | None = None, shown: Callable[[str], str] = str) -> int:
+    """Build the report of a profile from its exported tables. Returns 0, or 2 if the tables are faulty.
+
+    Args:
+        argv: the options.
+        shown: how a message is printed, which names folders as they were typed.
+    """
+    parser = argparse.ArgumentParser(prog="python -m reports.build", description=str(main.__doc__).partition("\n")[0])
     parser.add_argument("--profile", default="quick", help="profile that made the runs (default: quick)")
     parser.add_argument("--study", help="report on this study alone")
     parser.add_argument("--runs", type=Path, help="folder of the tables (default: reports/PROFILE/runs)")
@@ -110,9 +115,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         files = build(args.runs or home / "runs", out, args.profile, args.study)
     except TableError as error:
-        print(error, file=sys.stderr)
+        print(shown(str(error)), file=sys.stderr)
         return 2
-    print(f"{len(files)} files; start with {out / 'index.html'}")
+    print(shown(f"{len(files)} files; start with {out / 'index.html'}"))
     return 0
 
 
@@ -286,7 +291,7 @@ def _sections(report: Report, pictures: Path) -> list[page.Section]:
     of_table |= {name: "ablation" for name in ("table_2",) if name in report.tables}
     whole = [_section(report, pictures, "method", "The method and its tasks", "", ("table_1",))]
     whole += [
-        _section(report, pictures, f"study-{study.replace('@', '-')}", _heading(report.results, study), study, names)
+        _section(report, pictures, f"study-{study.replace('@', '.')}", _heading(report.results, study), study, names)
         for study in studies
         for names in [tuple(name for name, owner in of_table.items() if owner == study)]
     ]

@@ -1,12 +1,22 @@
 """Trained policies looked at again: on a bank of episodes, with other numbers of agents, and what they assign."""
 
-import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from pipelines.commands.common import File, Json, Profile, Sets, Variant, folder_option, load_study, say_json, table
+from pipelines.commands.common import (
+    File,
+    Json,
+    Profile,
+    Sets,
+    Variant,
+    folder_option,
+    load_study,
+    say_json,
+    table,
+    tell,
+)
 from pipelines.errors import InputError
 
 CHECKPOINT = ".pt"
@@ -97,7 +107,7 @@ def transfer(
             [str(x) for x in row[1:3]] + [f"{row[5]} x {row[6]}", f"{row[10]:.2f} ± {row[11]:.2f}"] for row in rows
         ]
         table(["arm", "seed", "agents x targets", "return"], shown, numbers=["seed", "return"])
-        print(f"wrote {export_transfer(rows, out)}", file=sys.stderr)
+        tell(f"wrote {export_transfer(rows, out)}")
 
 
 def assignments(
@@ -125,7 +135,7 @@ def assignments(
             last = run.points[-1][1]
             cells = [run.item.card.arm, str(run.item.card.seed), *(f"{last[PREFIX + name]:.4f}" for name in columns)]
             table(["arm", "seed", *columns], [cells], numbers=["seed", *columns])
-            print(f"wrote {written}", file=sys.stderr)
+            tell(f"wrote {written}")
 
 
 def _counts(option: str, text: str) -> list[int]:

@@ -1,7 +1,6 @@
 """`rhmc study`: check, run, follow and move studies; `rhmc export` for the report."""
 
 import shlex
-import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,6 +20,7 @@ from pipelines.commands.common import (
     say,
     say_json,
     table,
+    tell,
 )
 from pipelines.errors import InputError
 
@@ -30,6 +30,8 @@ app = typer.Typer(help="Check, run, follow and move studies.", no_args_is_help=T
 @app.command("check")
 def check(file: File, profile: Profile = "quick", variant: Variant = None, overrides: Sets = None) -> None:
     """Say what a study would run, or everything that is wrong with it. Starts nothing."""
+    from pipelines.origin import another
+    from pipelines.store import Home, work_folder
     from pipelines.study import changes
 
     study = load_study(file, profile, overrides, variant)
@@ -38,6 +40,8 @@ def check(file: File, profile: Profile = "quick", variant: Variant = None, overr
         differs = ", ".join(f"{key}={value}" for key, value in changes(study.base, setting).items()) or "the base"
         rows.append([arm, differs, str(study.seeds), f"{study.steps:,}", str(setting.trainer.num_envs)])
     say(f"{study.name} ({study.profile}): {study.question}")
+    if remark := another(Home(work_folder()), study.name, study.profile, study.file):
+        say(remark)
     table(["arm", "differs in", "seeds", "steps", "copies"], rows, numbers=("seeds", "steps", "copies"))
     runs = len(study.arms) * study.seeds
     say(f"{runs} runs, {runs * study.steps:,} environment steps in all, {study.resources.concurrent} runs at a time")
@@ -92,7 +96,7 @@ def _listed(file: Path) -> dict[str, Any] | None:
     nodes = root.children if root else {}
     if "arms" in nodes and any("space" in arm.children for arm in nodes["arms"].children.values()):
         return None
-    question = str(nodes["question"].value) if "question" in nodes else ""
+    question = " ".join(str(nodes["question"].value).split()) if "question" in nodes else ""
     fault = "" if question else str(faults[0]) if faults else "no question"
     variants = list(nodes["variants"].children) if "variants" in nodes else []
     return {"study": str(file), "question": question, "variants": variants, "fault": fault}
@@ -152,6 +156,10 @@ def export(
     """Write each study's results as one tidy table and a table of its runs, for the report."""
     studies = load_studies(files, profile, overrides, variant)
     from pipelines.export import export_study
+    from pipelines.plan import given_twice
+
+    if faults := given_twice(studies):
+        raise InputError(*faults)
 
     code = DONE
     for study in studies:
@@ -162,5 +170,5 @@ def export(
     words += ["--profile", profile] if profile != "quick" else []
     words += ["--variant", variant] if variant and len(files) == 1 else []
     words += ["--runs", str(out)] if out else []
-    print(f"next:  {shlex.join(words)}", file=sys.stderr)
+    tell(f"next:  {shlex.join(words)}")
     raise typer.Exit(code)

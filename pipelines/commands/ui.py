@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from pipelines.commands.common import DONE, UNFINISHED, say
+from pipelines.commands.common import DONE, UNFINISHED, say, tell
 from pipelines.errors import InputError
 
 HOST = "127.0.0.1"
@@ -79,7 +79,7 @@ def _serve(uri: str, artifacts: Path, port: int, saved: Iterable[tuple[str, str,
         _end(server)
         return
     if code:
-        print(f"rhmc: MLflow's server ended with exit code {code}; {log} says why", file=sys.stderr)
+        tell(f"rhmc: MLflow's server ended with exit code {code}; {log} says why")
     raise typer.Exit(UNFINISHED if code else DONE)
 
 

@@ -1,14 +1,13 @@
 """`rhmc yardsticks`: scores of policies that need no learning."""
 
 import inspect
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipelines.commands.common import DONE, Json, Profile, folder_option, say_json, table
+from pipelines.commands.common import DONE, Json, Profile, folder_option, profile_faults, say_json, table, tell
 from pipelines.errors import InputError
 
 if TYPE_CHECKING:
@@ -68,7 +67,7 @@ def _score(
             from pipelines.yardsticks import Bank, Scored, export_yardsticks
 
             written = export_yardsticks([Scored(Bank(env, tuple(scores), episodes, seed), scores)], profile, out)
-            print(f"wrote {written}", file=sys.stderr)
+            tell(f"wrote {written}")
     if as_json:
         say_json(scores)
         raise typer.Exit(DONE)
@@ -79,15 +78,13 @@ def _score(
 
 def _check(kind: str, policies: list[str], profile: str) -> None:
     from pipelines.document import choices
-    from pipelines.study import PROFILES
     from rhmc.yardsticks import names
 
     known = names(kind)
     faults = [f"--policies: '{n}' is not allowed; {choices(n, known)}" for n in policies if n not in known]
-    if profile not in PROFILES:
-        faults.append(f"--profile: '{profile}' is not allowed; {choices(profile, PROFILES)}")
+    faults += profile_faults(profile)
     if faults:
-        raise InputError("\n".join(faults))
+        raise InputError(*faults)
 
 
 def _env(kind: str, fields: Fields) -> Any:
@@ -100,7 +97,7 @@ def _env(kind: str, fields: Fields) -> Any:
 
     cfg, faults = validate(ENVS[kind][0], node({name: node(value, name) for name, value in fields.items()}, kind))
     if cfg is None:
-        raise InputError("\n".join(str(fault) for fault in faults))
+        raise InputError(*map(str, faults))
     return cfg
 
 
@@ -143,10 +140,10 @@ def everything(
         for scored in score_banks(wanted, jobs):
             found.append(scored)
             policies = f"{len(scored.scores)} policies" if len(scored.scores) > 1 else next(iter(scored.scores))
-            print(f"{len(found)} of {len(wanted)}: {_named(scored)}: {policies}", file=sys.stderr, flush=True)
+            tell(f"{len(found)} of {len(wanted)}: {_named(scored)}: {policies}")
         written = export_yardsticks(found, profile, out)
     _show(found)
-    print(f"wrote {written}", file=sys.stderr)
+    tell(f"wrote {written}")
 
 
 def _show(found: list["Scored"]) -> None:

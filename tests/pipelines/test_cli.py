@@ -90,7 +90,7 @@ VERBS = [
     *([], ["study"], ["study", "run"], ["study", "export"], ["study", "import"], ["yardsticks"], ["evaluate"]),
     *(["yardsticks", "all"], ["transfer"], ["assignments"]),
     *(["search"], ["search", "check"], ["search", "run"], ["search", "status"]),
-    *(["export"], ["report"], ["ui"], ["doctor"]),
+    *(["export"], ["report"], ["ui"], ["doctor"], ["profile"]),
 ]
 
 
@@ -291,7 +291,7 @@ def test_studies_that_cannot_run_together(rhmc: Rhmc, tmp_path: Path) -> None:
     said = rhmc("study", "run", "studies/x.yaml", "studies/y.yaml", "studies/x.yaml")
     twice, shared = said.err.splitlines()
     assert said.code == 2
-    assert twice == "x: given 2 times; studies that run together need names of their own"
+    assert twice == "x: given 2 times; studies that go together need names of their own"
     assert shared.startswith("resources.concurrent is 3 in y and 2 in x; ")
     assert not (tmp_path / "work").exists()
 
@@ -328,7 +328,7 @@ def test_an_interrupt_is_130(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> Non
 @pytest.mark.parametrize("options", [["--profile", "paper"], ["--profile", "quick", "--runs", "a", "--out", "b"]])
 def test_report_hands_on_its_options(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch, options: list[str]) -> None:
     calls: list[list[str]] = []
-    build = SimpleNamespace(main=lambda given: calls.append(given) or 2)
+    build = SimpleNamespace(main=lambda given, shown: calls.append(given) or 2)
     monkeypatch.setitem(sys.modules, "reports.build", build)
     assert rhmc("report", *options).code == 2
     assert calls == [options]

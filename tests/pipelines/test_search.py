@@ -646,8 +646,9 @@ def test_the_winner_says_where_it_comes_from_and_a_study_includes_it(tmp_path: P
 
 def test_names_of_arms_become_names_of_files() -> None:
     search = load()
-    assert file_name(search, "RHMC, no filter") == "search_x.rhmc-no-filter.quick.yaml"
-    assert file_name(search, "…") == "search_x.arm.quick.yaml"
+    assert file_name(search, "HiT-MAC") == "search_x.hit-mac.quick.yaml"
+    assert file_name(search, "RHMC, no filter") == "search_x.rhmc-no-filter-6c95856d.quick.yaml"
+    assert file_name(search, "…") == "search_x.name-b4935894.quick.yaml"
 
 
 def test_no_plot_without_trials_for_it(tmp_path: Path) -> None:
