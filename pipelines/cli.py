@@ -7,11 +7,13 @@ Exit codes: 0 done, 1 some run failed, 2 bad input (nothing was started), 130 in
 
 import os
 import sys
+import traceback
 
 import typer
 
+from pipelines.addresses import reach_loopback, scrubbed
 from pipelines.commands import doctor, evaluate, render, science, search, study, ui, yardsticks
-from pipelines.commands.common import BAD, DONE, INTERRUPTED
+from pipelines.commands.common import BAD, DONE, INTERRUPTED, UNFINISHED
 from pipelines.errors import InputError
 
 EXIT_CODES = (
@@ -45,16 +47,20 @@ app.command("doctor", rich_help_panel=CODE)(doctor.doctor)
 
 def main() -> None:
     """Entry point: what a user can mend is one message on stderr and exit code 2."""
+    reach_loopback()
     try:
         app(prog_name="rhmc")
     except InputError as error:
-        print(error, file=sys.stderr)
+        print(scrubbed(str(error)), file=sys.stderr)
         sys.exit(BAD)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
     except BrokenPipeError:  # the reader of our output has gone, as in `rhmc study list | head -1`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(DONE)
+    except Exception:  # a fault of ours: the whole of it, but for what nobody should see
+        print(scrubbed(traceback.format_exc()), file=sys.stderr, end="")
+        sys.exit(UNFINISHED)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from typing import Literal, NamedTuple, Protocol
 from pipelines.host import Host
 from rhmc.types import Metrics
 
+IMPORTED, VALUES_ONLY = "imported", "values only"  # the tag of a run from a bundle, and its value without a policy
 Status = Literal["running", "finished", "failed", "interrupted"]
 
 
@@ -61,6 +62,7 @@ class Recorded(NamedTuple):
     commit: str
     stale: bool = False  # marked as no part of the latest plan
     host: Host = Host()
+    values_only: bool = False  # taken in from a bundle without policies
 
 
 class Row(NamedTuple):
@@ -128,6 +130,10 @@ class Tracker(Protocol):
 
     def file(self, ref: str, name: str, folder: Path) -> Path | None:
         """Write a file that a run keeps to a folder; None if it keeps none of that name."""
+        ...
+
+    def files_of(self, ref: str) -> str:
+        """Where the files of a run are looked for, for a person."""
         ...
 
     def publish(self, note: str, files: Mapping[str, bytes]) -> None:
@@ -217,7 +223,16 @@ class MemoryTracker:
     def recorded(self) -> list[Recorded]:
         """See `Tracker`."""
         return [
-            Recorded(r.ref, r.card.arm, r.card.key, r.status, r.card.commit, "stale" in r.tags, r.card.host)
+            Recorded(
+                r.ref,
+                r.card.arm,
+                r.card.key,
+                r.status,
+                r.card.commit,
+                "stale" in r.tags,
+                r.card.host,
+                r.tags.get(IMPORTED) == VALUES_ONLY,
+            )
             for r in self._mine()
         ]
 
@@ -256,6 +271,10 @@ class MemoryTracker:
             return None
         (folder / name).write_bytes(run.files[name])
         return folder / name
+
+    def files_of(self, ref: str) -> str:
+        """See `Tracker`."""
+        return f"memory of {ref}"
 
     def publish(self, note: str, files: Mapping[str, bytes]) -> None:
         """See `Tracker`."""
