@@ -4,7 +4,7 @@ import json
 import os
 import re
 from collections.abc import Iterator, MutableMapping
-from urllib.parse import quote, quote_plus, unquote, unquote_plus
+from urllib.parse import quote, quote_plus, unquote, unquote_plus, urlsplit
 
 HIDDEN = "***"
 ADDRESSES = ("MLFLOW_TRACKING_URI", "MLFLOW_REGISTRY_URI", "OPTUNA_STORAGE")  # that may have a password in them
@@ -41,8 +41,13 @@ def unclear(address: str) -> bool:
 
 def fault(variable: str, address: str) -> str:
     """Why an address cannot be used, for a person; nothing if it is clear what in it is what."""
-    text = "not an address that can be read; in its name and password write @ as %40, / as %2F, ? as %3F and # as %23"
-    return f"{variable}={without_password(address)}: {text}" if unclear(address) else ""
+    shown = f"{variable}={without_password(address)}: not an address that can be read"
+    if unclear(address):
+        return f"{shown}; in its name and password write @ as %40, / as %2F, ? as %3F and # as %23"
+    try:
+        return "" if urlsplit(address).port != 0 else f"{shown}; its port is 0"
+    except ValueError:
+        return f"{shown}; after the host, if anything, comes a port from 1 to 65535, as in http://HOST:5000"
 
 
 def _shown_query(query: str) -> str:

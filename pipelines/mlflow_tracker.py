@@ -25,7 +25,7 @@ from pipelines import legend, moved, names, views
 from pipelines.addresses import fault, scrubbed, without_password
 from pipelines.errors import InputError
 from pipelines.host import Host
-from pipelines.sqlite import address, connect, reading_address, settle, sqlite_file
+from pipelines.sqlite import address, connect, connecting, reading_address, settle, sqlite_file
 from pipelines.store import Home, StoreError, one_line, replace_durably, sync
 from pipelines.tracker import IMPORTED, VALUES_ONLY, Card, Recorded, Row, Status, StudyCard, unseen
 from rhmc.types import Metrics
@@ -613,7 +613,7 @@ def check(uri: str, *, write: bool = True) -> None:
         raise StoreError(f"MLFLOW_TRACKING_URI={shown}: not an address; http://HOST:PORT and sqlite:///FILE are some")
     elif uri.partition(":")[0].partition("+")[0] in DATABASES:
         with explained(uri):  # once: MLflow would try for a minute and a half
-            create_engine(uri, poolclass=NullPool).connect().close()
+            create_engine(uri, poolclass=NullPool, connect_args=connecting(uri)).connect().close()
 
 
 def _check_file(path: Path, write: bool) -> None:

@@ -72,8 +72,7 @@ def bring_up_to_date(uri: str, home: Home) -> None:
     if uri.partition(":")[0].partition("+")[0] not in MOVABLE:
         return
     own = is_own(uri, home)
-    patience = {"timeout": sqlite.PATIENCE} if uri.startswith("sqlite") else {}
-    engine = create_engine(uri, poolclass=NullPool, connect_args=patience)
+    engine = create_engine(uri, poolclass=NullPool, connect_args=sqlite.connecting(uri))
     try:
         with engine.connect() as database:
             moved = [stored for stored in _locations(database) if _of_moved(database, stored, home, own=own)]

@@ -14,12 +14,21 @@ from pipelines.addresses import without_password
 from pipelines.store import StoreError
 
 PATIENCE = 20.0  # seconds that a reader waits for a writer, as MLflow's own do
+ANSWER = 20  # seconds that a database's server has to answer in its own language
 WAL = 2  # what byte 18 of a file says whose writers keep a log beside it
 
 
 def address(path: Path) -> str:
     """The address by which SQLAlchemy finds a file, whatever characters its path has."""
     return URL.create("sqlite", database=str(path)).render_as_string(hide_password=False)
+
+
+def connecting(uri: str) -> dict[str, int]:
+    """Arguments of a connection: so long it waits for a writer, or for a server that may be none of a database's."""
+    kind = uri.partition(":")[0].partition("+")[0]
+    if kind == "sqlite":
+        return {"timeout": int(PATIENCE)}
+    return {"connect_timeout": ANSWER} if kind in ("postgresql", "mysql") and "connect_timeout" not in uri else {}
 
 
 def sqlite_file(uri: str) -> Path:
@@ -57,7 +66,8 @@ def _reading(path: Path) -> str:
     have to be made there.
     """
     log = path.with_name(f"{path.name}-wal")
-    alone = not os.access(path.parent, os.W_OK) and not (log.exists() and log.stat().st_size) and _keeps_log(path)
+    closed = path.is_file() and not os.access(path.parent, os.W_OK)
+    alone = closed and not (log.exists() and log.stat().st_size) and _keeps_log(path)
     return f"{_uri(path)}?mode=ro{'&immutable=1' if alone else ''}"
 
 

@@ -29,7 +29,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from pipelines.addresses import fault, scrubbed, without_password
 from pipelines.search import Dimension, Pruner, Sampler, Search, Value
-from pipelines.sqlite import address, reading_address, settle, sqlite_file
+from pipelines.sqlite import address, connecting, reading_address, settle, sqlite_file
 from pipelines.store import Home, StoreError, one_line
 from pipelines.study import Setting
 from rhmc.types import Metrics
@@ -327,7 +327,7 @@ def opened(home: Home, *, write: bool = True) -> Iterator[BaseStorage | None]:
 
 def _open(url: str, write: bool) -> BaseStorage | None:
     if not url.startswith("sqlite:///"):
-        return RDBStorage(url, engine_kwargs={"pool_pre_ping": True})
+        return RDBStorage(url, engine_kwargs={"pool_pre_ping": True, "connect_args": connecting(url)})
     file = sqlite_file(url)
     if not write:
         if not file.exists() or file.stat().st_size == 0:

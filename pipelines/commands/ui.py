@@ -93,11 +93,13 @@ def _serve(uri: str, artifacts: Path, port: int, saved: Iterable[tuple[str, str,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
     )
-    Thread(target=_write_down, args=(server, log), daemon=True).start()
+    talk = Thread(target=_write_down, args=(server, log), daemon=True)
+    talk.start()
     try:
         if _answers(server, port):
             _tell(port, saved)
         code = server.wait()
+        talk.join(1.0)  # what it said last
     except KeyboardInterrupt:
         _end(server)
         return
