@@ -27,7 +27,7 @@ from pipelines.policy import CONFIG, FILE
 from pipelines.recorder import keep
 from pipelines.store import Checkpoints, Home, StoreError, whole
 from pipelines.study import RunSpec, Study
-from pipelines.tracker import Card, Row, StudyCard, Tracker, points_of
+from pipelines.tracker import IMPORTED, VALUES_ONLY, Card, Row, StudyCard, Tracker, points_of
 from rhmc.types import Frozen
 
 FORMAT = 2
@@ -136,7 +136,8 @@ def _fill(folder: Path, plan: list[Item], tracker: Tracker | None, home: Home, v
         if tracker and place in done:
             ref = recorded[place].ref
             points += [(len(runs), row.step, row.metric, row.value) for row in tracker.rows([ref])]
-            digest = "" if values_only else _policy(tracker, ref, folder / "policies" / f"{item.key}.pt")
+            bare = values_only or recorded[place].values_only
+            digest = "" if bare else _policy(tracker, ref, item, folder / "policies" / f"{item.key}.pt")
         elif values_only or not _checkpoints(home.checkpoints(item.key), folder / "checkpoints" / item.key):
             continue
         made = recorded[place].commit if place in recorded else ""
@@ -148,12 +149,13 @@ def _fill(folder: Path, plan: list[Item], tracker: Tracker | None, home: Home, v
     return Packed(len(plan), count, len(runs) - count)
 
 
-def _policy(tracker: Tracker, ref: str, file: Path) -> str:
-    """Put a run's policy in its place and return its digest, nothing if the log has none."""
+def _policy(tracker: Tracker, ref: str, item: Item, file: Path) -> str:
+    """Put a run's policy in its place and return its digest."""
     with TemporaryDirectory() as name:
         kept = tracker.file(ref, FILE, Path(name))
         if kept is None:
-            return ""
+            remedy = "put it back, or leave policies behind with --values-only"
+            raise StoreError(f"{item.name}: its run keeps no {FILE} in {tracker.files_of(ref)}; {remedy}")
         file.parent.mkdir(exist_ok=True)
         shutil.copyfile(kept, file)
     return _digest(file)
@@ -228,7 +230,7 @@ def _log(tracker: Tracker, study: StudyCard, entry: Entry, folder: Path) -> None
             (Path(name) / CONFIG).write_text(resolved_yaml(entry.item, study))  # for a policy without its spec
             shutil.copyfile(folder / "policies" / f"{entry.item.key}.pt", Path(name) / FILE)
             keep(log, Path(name))
-    log.tag("imported", "yes")
+    log.tag(IMPORTED, "yes" if entry.policy else VALUES_ONLY)
     log.finish("finished")
 
 

@@ -8,6 +8,7 @@ Exit codes: 0 done, 1 some run failed, 2 bad input (nothing was started), 130 in
 import errno
 import os
 import sys
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -15,8 +16,9 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
+from pipelines.addresses import reach_loopback, scrubbed
 from pipelines.commands import doctor, evaluate, render, science, search, study, ui, yardsticks
-from pipelines.commands.common import BAD, DONE, INTERRUPTED
+from pipelines.commands.common import BAD, DONE, INTERRUPTED, UNFINISHED
 from pipelines.errors import InputError, visible
 
 EXIT_CODES = (
@@ -78,10 +80,11 @@ app.command("doctor", rich_help_panel=CODE)(doctor.doctor)
 
 def main() -> None:
     """Entry point: what a user can mend is one message on stderr and exit code 2."""
+    reach_loopback()
     try:
         app(prog_name="rhmc")
     except InputError as error:
-        print(error, file=sys.stderr)
+        print(scrubbed(str(error)), file=sys.stderr)
         sys.exit(BAD)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
@@ -94,6 +97,9 @@ def main() -> None:
         limit = "; at most 255 bytes a name, 4,095 a path" if error.errno == errno.ENAMETOOLONG else ""
         print(InputError(f"{os.fsdecode(error.filename)}: {error.strerror}{limit}"), file=sys.stderr)
         sys.exit(BAD)
+    except Exception:  # a fault of ours: the whole of it, but for what nobody should see
+        print(scrubbed(traceback.format_exc()), file=sys.stderr, end="")
+        sys.exit(UNFINISHED)
 
 
 if __name__ == "__main__":

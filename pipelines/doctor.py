@@ -10,7 +10,8 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from pipelines.store import Home, StoreError, one_line, without_password
+from pipelines.addresses import without_password
+from pipelines.store import Home, StoreError, one_line
 
 PYTHON = (3, 11)
 NEEDED = 2 * 2**30  # bytes free: a study of many runs with their checkpoints

@@ -15,7 +15,7 @@ from pipelines.plan import Item, chosen, study_card
 from pipelines.policy import CONFIG, FILE, Actor, NoPolicyError, Saved, load, settings
 from pipelines.store import Home
 from pipelines.study import Study
-from pipelines.tracker import Tracker
+from pipelines.tracker import Recorded, Tracker
 from rhmc.algorithms.base import Algorithm
 from rhmc.envs import ENVS, EnvConfig
 from rhmc.evaluate import evaluate
@@ -111,18 +111,18 @@ def of_study(study: Study, home: Path, arms: Sequence[str] = (), seeds: Sequence
     """The policies of a study's runs: kept ones of the finished, the newest checkpoint of the others.
 
     Raises:
-        InputError: there is no such arm, or no policy at all.
+        InputError: there is no such arm, no policy at all, or a finished run has lost its own.
     """
     plan = chosen(study, fingerprint(), arms, seeds)
     from pipelines.mlflow_tracker import open_existing
 
     place = Home(home)
     tracker = open_existing(study_card(study), place)
-    done = {(r.arm, r.key): r.ref for r in tracker.recorded() if r.status == "finished"} if tracker else {}
+    done = {(r.arm, r.key): r for r in tracker.recorded() if r.status == "finished"} if tracker else {}
     found = False
     for item in plan:
-        ref = done.get((item.card.arm, item.key))
-        saved = _kept(tracker, ref, item) if tracker and ref else _begun(place, item)
+        run = done.get((item.card.arm, item.key))
+        saved = _kept(tracker, run, item) if tracker and run else _begun(place, item)
         if saved is not None:
             found = True
             yield Policy(item.card.arm, saved)
@@ -134,14 +134,18 @@ def of_study(study: Study, home: Path, arms: Sequence[str] = (), seeds: Sequence
         raise InputError(f"{study.name} ({study.profile}): {reason}")
 
 
-def _kept(tracker: Tracker, ref: str, item: Item) -> Saved | None:
-    """The policy of a finished run."""
+def _kept(tracker: Tracker, run: Recorded, item: Item) -> Saved | None:
+    """The policy of a finished run; None if it came without one."""
     with TemporaryDirectory() as folder:
-        file = tracker.file(ref, FILE, Path(folder))
+        file = tracker.file(run.ref, FILE, Path(folder))
+        if file is None:
+            if run.values_only:
+                return None
+            raise InputError(f"{item.name}: its run {run.ref} keeps no {FILE} in {tracker.files_of(run.ref)}")
         try:
-            return load(file, item.spec) if file else None
+            return load(file, item.spec)
         except NoPolicyError as error:
-            raise InputError(f"{item.name}: the {FILE} that its run {ref} keeps is damaged") from error
+            raise InputError(f"{item.name}: the {FILE} that its run {run.ref} keeps is damaged") from error
 
 
 def _begun(home: Home, item: Item) -> Saved | None:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import ray
+from pyarrow.fs import LocalFileSystem
 from ray import tune
 from ray.exceptions import RayError
 from ray.tune.experiment import Trial
@@ -130,6 +131,7 @@ def fit(jobs: list[dict[str, Any]], recorder: Recorders, scratch: Path, concurre
         run_config=tune.RunConfig(
             name="trials",
             storage_path=str(scratch),
+            storage_filesystem=LocalFileSystem(),  # the path is one, and no address, whatever characters it has
             verbose=0,
             callbacks=[bridge],
             stop=Halt(bridge),

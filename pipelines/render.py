@@ -173,7 +173,7 @@ def _fetch(ref: str, home: Home, folder: Path) -> Path:
     except StoreError as error:
         raise InputError(str(error)) from error
     if policy.FILE not in found:
-        raise InputError(f"run {ref} keeps no {policy.FILE}: it is not finished")
+        raise InputError(f"run {ref} keeps no {policy.FILE}: it is not finished, or the file is gone")
     return folder
 
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple, Self
 
 from rich.console import Console
 
+from pipelines.addresses import without_password
 from pipelines.errors import InputError, visible
 from pipelines.fingerprint import fingerprint
 from pipelines.host import Host, host
@@ -23,7 +24,7 @@ from pipelines.progress import Board, board, print_table
 from pipelines.ray_settings import set_up_ray
 from pipelines.recorder import Recorder
 from pipelines.recorders import Recorders
-from pipelines.store import Home, StoreError, without_password
+from pipelines.store import Home, StoreError
 from pipelines.study import Study
 from pipelines.tracker import Tracker
 
@@ -189,6 +190,8 @@ def _logged(study: Study, code: Code, home: Home, display: Board) -> Iterator[La
     tracker = MlflowTracker(card, home)
     recorder = None
     try:
+        for remark in tracker.remarks:
+            display.say(f"{study.name}: {remark}")
         recorder = Recorder(card, items(study, *code), tracker, home, display)
         yield Launched(study, tracker, recorder)
     finally:
@@ -332,7 +335,7 @@ def _status(study: Study, home: Home) -> tuple[dict[str, dict[str, int]], bool, 
     recorded = tracker.recorded() if tracker else []
     plan = items(study, fingerprint(), "")
     # Runs of a driver that was killed are logged as running; a log in this folder knows no other driver than one here.
-    own = tracker is not None and tracker.uri == f"sqlite:///{home.database}"
+    own = tracker is not None and tracker.own
     seen = {"running": "interrupted"} if own and not home.driven(study.name, study.profile) else {}
     state = {(run.arm, run.key): seen.get(run.status, run.status) for run in recorded}
     planned = {(item.card.arm, item.key) for item in plan}

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 from rich.console import Console
 from ruamel.yaml import YAML
 
+from pipelines.addresses import without_password
 from pipelines.errors import visible
 from pipelines.fingerprint import fingerprint
 from pipelines.found import file_name, stem, winner_yaml, write_text
@@ -27,7 +28,7 @@ from pipelines.progress import Board, StopFile, board, print_table
 from pipelines.ray_settings import set_up_ray
 from pipelines.run import BAD, DONE, FAILED, Interrupts, guarded
 from pipelines.search import Search
-from pipelines.store import Checkpoints, Home, StoreError, without_password
+from pipelines.store import Checkpoints, Home, StoreError
 from pipelines.tracker import Card, RunLog, Status, StudyCard, Tracker
 from pipelines.trials import OBJECTIVE, Asked, BaseStorage, Ledger, explained, look, opened, storage_url
 from rhmc.types import Metrics
@@ -96,6 +97,8 @@ def _launch(search: Search, home: Home, storage: BaseStorage, out: Path, interru
             if remark := another(home, search.name, search.profile, search.file):
                 display.say(remark)
             remember(home, search.name, search.profile, search.file)
+            for remark in tracker.remarks:
+                display.say(remark)
             ledgers = [Ledger(search, arm, code, storage) for arm in search.arms]
             for ledger in ledgers:
                 again = ledger.take_up()

@@ -1,11 +1,11 @@
 """The work folder: where it is, who may write to a study, and checkpoints that survive a killed process."""
 
 import errno
+import fcntl
 import hashlib
 import os
 import shutil
 import socket
-import urllib.parse
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -15,6 +15,7 @@ from typing import Any, BinaryIO
 import torch
 from filelock import BaseFileLock, FileLock, Timeout
 
+from pipelines.addresses import scrubbed
 from pipelines.errors import InputError
 from rhmc.types import State
 
@@ -25,7 +26,10 @@ OUT_OF_IT = errno.EINVAL  # what seeking to before the start of a file gives
 
 
 class StoreError(InputError):
-    """Something outside the program is in the way; str() is the whole message, one line."""
+    """Something outside the program is in the way; str() is the whole message, one line, without passwords."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(scrubbed(text))
 
 
 class DamagedError(StoreError):
@@ -33,8 +37,19 @@ class DamagedError(StoreError):
 
 
 def work_folder() -> Path:
-    """`$RHMC_HOME`, or `work` in the current folder."""
-    return Path(os.environ.get("RHMC_HOME") or "work").resolve()
+    """`$RHMC_HOME`, with `~` as a shell understands it, or `work` in the current folder.
+
+    Raises:
+        StoreError: it is no path that the files of a database can have.
+    """
+    name = os.path.expanduser(os.environ.get("RHMC_HOME") or "work")
+    try:
+        name.encode()
+        return Path(name).resolve()
+    except UnicodeEncodeError as error:
+        raise StoreError(f"RHMC_HOME={name!a}: not in UTF-8; name another folder") from error
+    except (OSError, RuntimeError) as error:  # links that lead to themselves
+        raise StoreError(f"RHMC_HOME={name}: {reason(error)}; name another folder") from error
 
 
 class Home:
@@ -103,12 +118,12 @@ class Home:
 
     def driven(self, study: str, profile: str) -> bool:
         """Whether a process drives the study and profile in this folder."""
-        path = self._lock_file(study, profile)
-        if not path.exists():
-            return False
-        with suppress(Timeout), FileLock(path).acquire(timeout=0):
-            return False
-        return True
+        with suppress(FileNotFoundError), self._lock_file(study, profile).open("rb") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # let go as the file is closed
+            except BlockingIOError:
+                return True
+        return False
 
     def _lock_file(self, study: str, profile: str) -> Path:
         return self.root / "locks" / f"{study}-{profile}.lock"
@@ -309,15 +324,6 @@ KEPT: dict[frozenset[str], Callable[[], State]] = {  # what learning keeps, by i
     frozenset(("rows",)): lambda: {"rows": []},
     frozenset(("rows", "count")): lambda: {"rows": {}, "count": torch.zeros(0, dtype=torch.int64)},
 }
-
-
-def without_password(uri: str) -> str:
-    """An address as it may be shown."""
-    try:
-        password = urllib.parse.urlsplit(uri).password
-    except ValueError:  # brackets that hold no address
-        return uri
-    return uri.replace(f":{password}@", ":***@", 1) if password else uri
 
 
 def one_line(error: BaseException) -> str:

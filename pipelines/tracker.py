@@ -13,6 +13,7 @@ from typing import Literal, NamedTuple, Protocol
 from pipelines.host import Host
 from rhmc.types import Metrics
 
+IMPORTED, VALUES_ONLY = "imported", "values only"  # the tag of a run from a bundle, and its value without a policy
 Status = Literal["running", "finished", "failed", "interrupted"]
 
 
@@ -62,6 +63,7 @@ class Recorded(NamedTuple):
     stale: bool = False  # marked as no part of the latest plan
     host: Host = Host()
     error: str = ""  # why it failed, one line
+    values_only: bool = False  # taken in from a bundle without policies
 
 
 class Row(NamedTuple):
@@ -129,6 +131,10 @@ class Tracker(Protocol):
 
     def file(self, ref: str, name: str, folder: Path) -> Path | None:
         """Write a file that a run keeps to a folder; None if it keeps none of that name."""
+        ...
+
+    def files_of(self, ref: str) -> str:
+        """Where the files of a run are looked for, for a person."""
         ...
 
     def publish(self, note: str, files: Mapping[str, bytes]) -> None:
@@ -227,6 +233,7 @@ class MemoryTracker:
                 "stale" in r.tags,
                 r.card.host,
                 r.tags.get("error", ""),
+                r.tags.get(IMPORTED) == VALUES_ONLY,
             )
             for r in self._mine()
         ]
@@ -266,6 +273,10 @@ class MemoryTracker:
             return None
         (folder / name).write_bytes(run.files[name])
         return folder / name
+
+    def files_of(self, ref: str) -> str:
+        """See `Tracker`."""
+        return f"memory of {ref}"
 
     def publish(self, note: str, files: Mapping[str, bytes]) -> None:
         """See `Tracker`."""

@@ -25,10 +25,11 @@ from optuna.pruners import BasePruner, MedianPruner, NopPruner, SuccessiveHalvin
 from optuna.samplers import BaseSampler, RandomSampler, TPESampler
 from optuna.storages import BaseStorage, InMemoryStorage, RDBStorage
 from optuna.trial import FrozenTrial, TrialState
-from sqlalchemy.engine import make_url
 from sqlalchemy.exc import SQLAlchemyError
 
+from pipelines.addresses import fault, scrubbed, without_password
 from pipelines.search import Dimension, Pruner, Sampler, Search, Value
+from pipelines.sqlite import address, connecting, reading_address, settle, sqlite_file
 from pipelines.store import Home, StoreError, one_line
 from pipelines.study import Setting
 from rhmc.types import Metrics
@@ -76,13 +77,13 @@ class Ledger:
     def __init__(self, search: Search, arm: str, fingerprint: str, storage: BaseStorage) -> None:
         self.search, self.arm = search, arm
         self.name = study_name(search, arm, fingerprint)
-        self.study = optuna.create_study(
-            storage=storage,
-            study_name=self.name,
-            direction="maximize",
-            pruner=make_pruner(search.pruner),
-            load_if_exists=True,
-        )
+        pruner = make_pruner(search.pruner)
+        if self.name in optuna.get_all_study_names(storage):  # which may be closed to writers
+            self.study = optuna.load_study(study_name=self.name, storage=storage, pruner=pruner)
+        else:
+            self.study = optuna.create_study(
+                storage=storage, study_name=self.name, direction="maximize", pruner=pruner, load_if_exists=True
+            )
         self.space = search.arms[arm].space
         self.live: dict[int, optuna.Trial] = {}
 
@@ -186,7 +187,7 @@ class Ledger:
 
     def _close(self, number: int, key: str, text: str, state: TrialState) -> None:
         live = self.live.pop(number)
-        live.set_user_attr(key, text[:2000])
+        live.set_user_attr(key, scrubbed(text)[:2000])
         self.study.tell(live, state=state)
 
     def best(self) -> Best | None:
@@ -289,7 +290,7 @@ class _Standing:
 
 def storage_url(home: Home) -> str:
     """`$OPTUNA_STORAGE`, such as `postgresql://user@host/optuna`, or SQLite in the work folder."""
-    return os.environ.get("OPTUNA_STORAGE") or f"sqlite:///{home.searches}"
+    return os.environ.get("OPTUNA_STORAGE") or address(home.searches)
 
 
 def open_storage(home: Home, *, write: bool = True) -> BaseStorage | None:
@@ -300,13 +301,16 @@ def open_storage(home: Home, *, write: bool = True) -> BaseStorage | None:
     """
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     url = storage_url(home)
+    shown = without_password(url)
+    if said := fault("OPTUNA_STORAGE", url):
+        raise StoreError(said)
     if "://" not in url:
-        raise StoreError(f"OPTUNA_STORAGE={url}: not the address of a database; sqlite:///FILE is one")
+        raise StoreError(f"OPTUNA_STORAGE={shown}: not the address of a database; sqlite:///FILE is one")
     try:
         with explained(url):
             return _open(url, write)
     except (OSError, ImportError, RuntimeError) as error:
-        raise StoreError(f"{_shown(url)}: Optuna cannot use this database: {one_line(error)}") from error
+        raise StoreError(f"{shown}: Optuna cannot use this database: {one_line(error)}") from error
 
 
 @contextmanager
@@ -323,10 +327,13 @@ def opened(home: Home, *, write: bool = True) -> Iterator[BaseStorage | None]:
 
 def _open(url: str, write: bool) -> BaseStorage | None:
     if not url.startswith("sqlite:///"):
-        return RDBStorage(url, engine_kwargs={"pool_pre_ping": True})
-    file = Path(url.removeprefix("sqlite:///"))
-    if not write and not file.exists():
-        return None
+        return RDBStorage(url, engine_kwargs={"pool_pre_ping": True, "connect_args": connecting(url)})
+    file = sqlite_file(url)
+    if not write:
+        if not file.exists() or file.stat().st_size == 0:
+            return None
+        settle(file)
+        return RDBStorage(reading_address(file), skip_table_creation=True)
     _create(file)
     return RDBStorage(url, engine_kwargs={"connect_args": {"timeout": 60}})
 
@@ -341,7 +348,7 @@ def _create(file: Path) -> None:
         part = file.with_name(f"{file.name}.part")
         part.unlink(missing_ok=True)
         try:
-            RDBStorage(f"sqlite:///{part}").engine.dispose()
+            RDBStorage(address(part)).engine.dispose()
             part.replace(file)
         finally:
             part.unlink(missing_ok=True)
@@ -355,11 +362,4 @@ def explained(url: str) -> Iterator[None]:
     except StoreError:
         raise
     except (optuna.exceptions.OptunaError, SQLAlchemyError, sqlite3.Error) as error:
-        raise StoreError(f"{_shown(url)}: Optuna cannot go on: {one_line(error)}") from error
-
-
-def _shown(url: str) -> str:
-    try:
-        return make_url(url).render_as_string(hide_password=True)
-    except SQLAlchemyError:
-        return "OPTUNA_STORAGE"
+        raise StoreError(f"{without_password(url)}: Optuna cannot go on: {one_line(error)}") from error

@@ -34,7 +34,9 @@ VERBS = ("common", "doctor", "evaluate", "render", "science", "search", "study",
 ONLY = {
     "mlflow": {"pipelines/histories.py", "pipelines/mlflow_tracker.py", "pipelines/registry.py", "pipelines/served.py"},
     "optuna": {"pipelines/trials.py", "pipelines/search_plots.py"},
-    "sqlalchemy": {"pipelines/mlflow_tracker.py", "pipelines/trials.py"},
+    "sqlalchemy": {
+        *("pipelines/mlflow_tracker.py", "pipelines/moved.py", "pipelines/sqlite.py", "pipelines/trials.py"),
+    },
     "matplotlib": {"pipelines/search_plots.py", "pipelines/overview.py"},
     "ray": {"pipelines/cluster.py", "pipelines/ray_driver.py", "pipelines/trainable.py", "pipelines/pool.py"},
     "typer": {"pipelines/cli.py", *(f"pipelines/commands/{name}.py" for name in VERBS)},
