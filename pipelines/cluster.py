@@ -36,7 +36,8 @@ HELLO = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"  # how a client of HTTP/2, which gRP
 DATA, HEADERS, SETTINGS = 0, 1, 4  # types of its frames
 LAST, WHOLE = 1, 4  # flags of frames: of a request, of its headers
 ALIVE = "/ray.rpc.NodeInfoGcsService/CheckAlive"  # what Ray's head answers to anybody, unless it wants a token
-STATUS, REFUSAL = b"grpc-status", b"InvalidAuthToken"  # in its answer; in that to one who has no token
+STATUS = b"grpc-status"  # in its answer; the length of a number and the number follow
+REFUSAL = STATUS + b"\x0216"  # of one who has no token
 
 
 def address() -> str:
@@ -63,14 +64,14 @@ def knock(where: str) -> None:
         raise _refused(where, one_line(error)) from error
     if os.environ.get("RAY_USE_TLS", "0") != "0":
         return  # who has no certificate gets no answer
-    if answered[3:4] != bytes([SETTINGS]) or STATUS not in answered:
+    if answered[3:4] != bytes([SETTINGS]) or not _told(answered):
         raise _refused(where, "what answers there is not Ray")
     if fault := _mismatch(locked=REFUSAL in answered):
         raise _refused(where, fault)
 
 
 def ask(host: str, port: int, call: str = ALIVE) -> bytes:
-    """What a program that speaks gRPC answers to a call without a token, as bytes; `STATUS` is in it at the end.
+    """What a program that speaks gRPC answers to a call without a token, as bytes; `STATUS` is in it.
 
     Raises:
         OSError: nobody listens, or nothing comes for `KNOCK` seconds.
@@ -82,12 +83,14 @@ def ask(host: str, port: int, call: str = ALIVE) -> bytes:
     with socket.create_connection((host, port), KNOCK) as line:
         line.settimeout(KNOCK)
         line.sendall(HELLO + request)
-        while STATUS not in answered and (more := line.recv(4096)):
+        while not _told(answered) and (more := line.recv(4096)):
             answered += more
-        line.settimeout(0.2)
-        with suppress(OSError):
-            answered += line.recv(4096)  # the reason, should it come in a packet of its own
     return answered
+
+
+def _told(answered: bytes) -> bool:
+    status = answered.partition(STATUS)[2]
+    return bool(status) and len(status) > status[0]
 
 
 def _frame(kind: int, flags: int, stream: int, body: bytes) -> bytes:
