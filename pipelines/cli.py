@@ -5,6 +5,7 @@ Everything heavy is imported by the verb that needs it, so that help answers at 
 Exit codes: 0 done, 1 some run failed, 2 bad input (nothing was started), 130 interrupted, 143 terminated.
 """
 
+import errno
 import os
 import sys
 
@@ -55,6 +56,11 @@ def main() -> None:
     except BrokenPipeError:  # the reader of our output has gone, as in `rhmc study list | head -1`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(DONE)
+    except OSError as error:
+        if error.errno not in (errno.EMFILE, errno.ENFILE):
+            raise
+        print(InputError(f"rhmc: {error}"), file=sys.stderr)
+        sys.exit(BAD)
 
 
 if __name__ == "__main__":

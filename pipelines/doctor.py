@@ -150,7 +150,7 @@ def starts_ray(home: Path | None = None) -> list[Finding]:
 
     set_up_ray()
     from pipelines.cluster import address, fence
-    from pipelines.ray_driver import ray_session
+    from pipelines.ray_driver import HERE, ray_session
 
     there = home if home and home.is_dir() else None
     try:
@@ -158,10 +158,10 @@ def starts_ray(home: Path | None = None) -> list[Finding]:
             notes = [Finding("note", "ray", remark) for remark in remarks[1:]]
             found = fence()
     except StoreError as error:
-        advice = "free memory and /tmp, then try again"
-        if address():
-            advice = "mend or start that cluster, or unset RAY_ADDRESS"
-        return [Finding("fault", "ray", f"{error}: {advice}")]
+        advice = ": mend or start that cluster, or unset RAY_ADDRESS" if address() else ""
+        if str(error).startswith(HERE):
+            advice = ": free memory and /tmp, then try again"
+        return [Finding("fault", "ray", f"{error}{advice}")]
     able = ", and every node can train" if there else ""
     if address():
         return [Finding("ok", "ray", f"the cluster at {address()} answers{able}"), *notes]

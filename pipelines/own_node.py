@@ -6,6 +6,7 @@ else can enter.
 """
 
 import os
+import resource
 import secrets
 import shutil
 import stat
@@ -21,6 +22,7 @@ from pipelines.store import StoreError
 
 AUTH = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 LONGEST = 107  # bytes in the name of a socket
+FILES, FILES_EACH = 128, 4  # that Ray's busiest process holds open: without a worker, and for each (found: 53, 2.5)
 INSIDE = "ray/session_2000-01-01_00-00-00_000000_4194304/sockets/plasma_store"  # the longest name that Ray adds
 
 
@@ -81,6 +83,23 @@ def private_folder(name: str) -> Iterator[Path]:
         yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def allow_files(workers: int) -> None:
+    """See that Ray's processes may open as many files as they need; with fewer, a launch waits for ever.
+
+    Raises:
+        StoreError: the hard limit, which only root can raise, is too low.
+    """
+    needed = FILES + FILES_EACH * workers
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if resource.RLIM_INFINITY != hard < needed:
+        raise StoreError(
+            f"{needed} open files are needed for runs on {workers} processor{'s' * (workers != 1)}, "
+            f"and {hard} are allowed (ulimit -Hn): raise that limit, or lower resources.concurrent"
+        )
+    if resource.RLIM_INFINITY != soft < needed:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (needed, hard))
 
 
 def _check_place(above: Path, excess: int) -> None:

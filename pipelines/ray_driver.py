@@ -15,13 +15,14 @@ from ray.tune.experiment import Trial
 from ray.tune.search import Searcher
 
 from pipelines.cluster import DEATHS, Deaths, Place, address, exposed, knock, outline, survey, travelling, watched
-from pipelines.own_node import closed, private_folder, read_again
+from pipelines.own_node import allow_files, closed, private_folder, read_again
 from pipelines.progress import StopFile
 from pipelines.ray_settings import OWN_NODE, RAY_SETTINGS, set_up_ray
 from pipelines.recorders import Recorders
 from pipelines.store import StoreError, one_line
 from pipelines.trainable import RunTrainable
 
+HERE = "Ray cannot be used, on this machine"  # how an error begins that Ray met while it started
 QUIET: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.CRITICAL}
 
 
@@ -53,7 +54,7 @@ def ray_session(concurrent: int, cpus: int = 1, name: str = "", home: Path | Non
 def _joined(where: str) -> Iterator[None]:
     knock(where)
     read_again()
-    with _explained(f"the cluster at RAY_ADDRESS={where}"):
+    with _explained(f"Ray cannot be used, the cluster at RAY_ADDRESS={where}"):
         ray.init(address=where, runtime_env=travelling(RAY_SETTINGS), **QUIET)
     try:
         head = ray.get_runtime_context().gcs_address
@@ -66,8 +67,9 @@ def _joined(where: str) -> Iterator[None]:
 
 @contextmanager
 def _started(cpus: int, name: str) -> Iterator[None]:
+    allow_files(cpus)
     with private_folder(name or str(os.getpid())) as folder, closed():
-        with _explained("on this machine"):
+        with _explained(HERE):
             set_up_ray(OWN_NODE)
             ray.init(
                 address="local",
@@ -88,7 +90,7 @@ def _explained(where: str) -> Iterator[None]:
     try:
         yield
     except (ConnectionError, OSError, RuntimeError, ValueError, RayError) as error:
-        raise StoreError(f"Ray cannot be used, {where}: {one_line(error)}") from error
+        raise StoreError(f"{where}: {one_line(error)}") from error
 
 
 def fit(jobs: list[dict[str, Any]], recorder: Recorders, scratch: Path, concurrent: int, cpus: int, stop: Path) -> None:

@@ -1,7 +1,10 @@
 """Who else can do what with a launch: strangers who know address and port, and other users of the same machine."""
 
+import errno
 import http.client
 import os
+import re
+import resource
 import stat
 import sys
 import tempfile
@@ -14,10 +17,11 @@ import psutil
 import pytest
 import ray
 
+from pipelines import cli
 from pipelines.cluster import ALIVE, REFUSAL, STATUS, ask
-from pipelines.own_node import AUTH, INSIDE, LONGEST, closed, private_folder
+from pipelines.own_node import AUTH, FILES, INSIDE, LONGEST, allow_files, closed, private_folder
 from pipelines.store import StoreError
-from tests.pipelines.fleet import SETTINGS, program
+from tests.pipelines.fleet import ROOT, SETTINGS, program
 
 UNKNOWN = STATUS + b"\x0212"  # gRPC's word for a call that a program does not have
 CALLS = (  # what a stranger would like to do, by service: read and write the head's table, lease a worker, run code
@@ -255,3 +259,54 @@ def test_a_place_with_too_long_a_name_says_by_how_much(place: Path, monkeypatch:
         else:
             with pytest.raises(StoreError, match="longer than 107 bytes: set TMPDIR to a folder whose name is 3 bytes"):
                 private_folder("x").__enter__()
+
+
+def test_too_low_a_limit_of_open_files_is_known_before_ray_starts(monkeypatch: pytest.MonkeyPatch) -> None:
+    limits, endless = [0, 0], resource.RLIM_INFINITY
+    monkeypatch.setattr(resource, "getrlimit", lambda kind: tuple(limits))
+    monkeypatch.setattr(resource, "setrlimit", lambda kind, wanted: limits.__setitem__(slice(None), wanted))
+    limits[:] = 40, 40
+    with pytest.raises(
+        StoreError,
+        match=r"136 open files are needed for runs on 2 processors, and 40 are allowed \(ulimit -Hn\): raise",
+    ):
+        allow_files(2)
+    for before, after in (
+        ([40, 4096], [136, 4096]),
+        ([40, endless], [136, endless]),
+        ([1024, 4096], [1024, 4096]),
+        ([endless, endless], [endless, endless]),
+    ):
+        limits[:] = before
+        allow_files(2)
+        assert limits == after
+
+
+def test_an_error_for_want_of_open_files_says_what_to_do(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    full = OSError(errno.EMFILE, os.strerror(errno.EMFILE), "/work/mlflow.db")
+    wrapped = StoreError(f"outer: {StoreError(f'x: cannot be written: {full.strerror}')}")
+    for error in (full, wrapped):
+
+        def fails(failure: Exception = error, **options: str) -> None:
+            raise failure
+
+        monkeypatch.setattr(cli, "app", fails)
+        with pytest.raises(SystemExit, match="2"):
+            cli.main()
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.count("Too many open files") == line.count(": raise the limit with `ulimit -n 4096`") == 1
+
+
+def test_only_the_closed_session_starts_ray() -> None:
+    files = [
+        path for folder in ("rhmc", "pipelines", "reports", "benchmarks") for path in (ROOT / folder).rglob("*.py")
+    ]
+    found = [path.name for path in files if re.search(r"ray\.init\(|ray\.scripts|RAY_AUTH_MODE=dis", path.read_text())]
+    assert sorted(found) == ["cluster.py", "ray_driver.py"]  # `cluster.py` names the way out
+
+
+@pytest.mark.ray
+def test_a_session_opens_fewer_files_than_it_asks_for(session: list[psutil.Process]) -> None:
+    assert max(process.num_fds() for process in session if process.pid != os.getpid()) < FILES
