@@ -91,15 +91,22 @@ def main() -> None:
     except BrokenPipeError:  # the reader of our output has gone, as in `rhmc study list | head -1`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(DONE)
-    except OSError as error:
-        if error.errno not in NO_PATH or error.filename is None:
-            raise
-        limit = "; at most 255 bytes a name, 4,095 a path" if error.errno == errno.ENAMETOOLONG else ""
-        print(InputError(f"{os.fsdecode(error.filename)}: {error.strerror}{limit}"), file=sys.stderr)
-        sys.exit(BAD)
-    except Exception:  # a fault of ours: the whole of it, but for what nobody should see
-        print(scrubbed(traceback.format_exc()), file=sys.stderr, end="")
+    except Exception as error:
+        if isinstance(error, OSError) and (found := _of_the_system(error)):
+            print(scrubbed(str(found)), file=sys.stderr)
+            sys.exit(BAD)
+        print(scrubbed(traceback.format_exc()), file=sys.stderr, end="")  # a fault of ours: the whole of it
         sys.exit(UNFINISHED)
+
+
+def _of_the_system(error: OSError) -> InputError | None:
+    """What the system refuses whatever the verb: a path that none can be, or one more open file."""
+    if error.errno in (errno.EMFILE, errno.ENFILE):
+        return InputError(f"rhmc: {error}")
+    if error.errno not in NO_PATH or error.filename is None:
+        return None
+    limit = "; at most 255 bytes a name, 4,095 a path" if error.errno == errno.ENAMETOOLONG else ""
+    return InputError(f"{os.fsdecode(error.filename)}: {error.strerror}{limit}")
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from pipelines.store import Home, StoreError, one_line
 PYTHON = (3, 11)
 NEEDED = 2 * 2**30  # bytes free: a study of many runs with their checkpoints
 LOCK = Path(__file__).parents[1] / "requirements.lock"
+LOOPBACK = "127.0.0.1"
 SHOWN = 4  # libraries that a line names
 
 Level = Literal["ok", "note", "fault"]
@@ -149,17 +150,27 @@ def starts_ray(home: Path | None = None) -> list[Finding]:
     from pipelines.ray_settings import set_up_ray
 
     set_up_ray()
-    from pipelines.cluster import address
-    from pipelines.ray_driver import ray_session
+    from pipelines.cluster import address, fence
+    from pipelines.ray_driver import HERE, ray_session
 
     there = home if home and home.is_dir() else None
     try:
         with ray_session(1, home=there) as remarks:
             notes = [Finding("note", "ray", remark) for remark in remarks[1:]]
+            found = fence()
     except StoreError as error:
-        advice = "free memory and /tmp, then try again"
-        if address():
-            advice = "mend or start that cluster, or unset RAY_ADDRESS"
-        return [Finding("fault", "ray", f"{error}: {advice}")]
+        advice = ": mend or start that cluster, or unset RAY_ADDRESS" if address() else ""
+        if str(error).startswith(HERE):
+            advice = ": free memory and /tmp, then try again"
+        return [Finding("fault", "ray", f"{error}{advice}")]
     able = ", and every node can train" if there else ""
-    return [Finding("ok", "ray", f"the cluster at {address()} answers{able}" if address() else "starts"), *notes]
+    if address():
+        return [Finding("ok", "ray", f"the cluster at {address()} answers{able}"), *notes]
+    return [_own(*found)]
+
+
+def _own(host: str, locked: bool) -> Finding:
+    if locked and host == LOOPBACK:
+        return Finding("ok", "ray", f"starts, listens on {host} alone and asks for a token")
+    text = f"starts, but listens on {host} and asks {'' if locked else 'nobody '}for a token: make setup"
+    return Finding("fault", "ray", text)

@@ -1,8 +1,12 @@
 """What a user can mend, and how text that others chose is shown. Imports nothing heavy: every verb needs it."""
 
+import errno
+import os
 import unicodedata
 
 MOST = 50  # lines of a message
+FULL = os.strerror(errno.EMFILE)
+REMEDY = "raise the limit with `ulimit -n 4096`"
 LONGEST = 2_000  # characters of a line
 
 
@@ -10,12 +14,14 @@ class InputError(Exception):
     """What was given cannot be used. Each argument is a line of the message, meant for a person. Exit code 2.
 
     A line may hold names, paths and values as they were typed: `str` shows them by `visible`, so that nobody's file
-    name moves the cursor, hides what follows, or adds a line of its own.
+    name moves the cursor, hides what follows, or adds a line of its own. Where the system has no room for another open
+    file, it says what to do.
     """
 
     def __str__(self) -> str:
         more = [f"and {len(self.args) - MOST:,} more"] if len(self.args) > MOST else []
-        return "\n".join([*(_cut(visible(str(line))) for line in self.args[:MOST]), *more])
+        text = "\n".join([*(_cut(visible(str(line))) for line in self.args[:MOST]), *more])
+        return f"{text}: {REMEDY}" if FULL in text and REMEDY not in text else text
 
 
 def visible(text: str) -> str:

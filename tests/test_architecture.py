@@ -38,7 +38,7 @@ ONLY = {
         *("pipelines/mlflow_tracker.py", "pipelines/moved.py", "pipelines/sqlite.py", "pipelines/trials.py"),
     },
     "matplotlib": {"pipelines/search_plots.py", "pipelines/overview.py"},
-    "ray": {"pipelines/cluster.py", "pipelines/ray_driver.py", "pipelines/trainable.py", "pipelines/pool.py"},
+    "ray": {f"pipelines/{name}.py" for name in ("cluster", "own_node", "ray_driver", "trainable", "pool")},
     "typer": {"pipelines/cli.py", *(f"pipelines/commands/{name}.py" for name in VERBS)},
     "reports": {"pipelines/commands/science.py"},
 }

@@ -1,6 +1,7 @@
 """What the doctor says of installations that are well and of those that are not."""
 
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -78,7 +79,15 @@ def test_a_cluster_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> None
 
 @pytest.mark.ray
 def test_ray_starts(cluster: None) -> None:
-    assert starts_ray() == [Finding("ok", "ray", "starts")]
+    text = "starts, listens on 127.0.0.1 alone and asks for a token"
+    assert starts_ray() == [Finding("ok", "ray", text)]
+
+
+@pytest.mark.parametrize("fence", [("192.0.2.1", True), ("127.0.0.1", False)])
+def test_a_ray_that_strangers_reach_is_a_fault(fence: tuple[str, bool], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipelines.ray_driver.ray_session", lambda *args, **kwargs: nullcontext([]))
+    monkeypatch.setattr("pipelines.cluster.fence", lambda: fence)
+    assert [one.level for one in starts_ray()] == ["fault"]
 
 
 def test_an_examination_goes_on_after_a_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -30,7 +30,6 @@ from pipelines.fingerprint import fingerprint
 from pipelines.mlflow_tracker import MlflowTracker, open_existing
 from pipelines.plan import Item, commit, items, study_card, what_varies
 from pipelines.progress import LiveBoard, PlainBoard, duration
-from pipelines.ray_driver import sockets
 from pipelines.recorder import Recorder
 from pipelines.recorders import Recorders
 from pipelines.run import Interrupts, _arguments, animated, run_studies, show_status
@@ -547,15 +546,6 @@ def test_a_signal_in_the_middle_of_a_print_disturbs_no_line(tmp_path: Path) -> N
     said = [line for line in lines if "interrupted" in line]
     assert said == ["interrupted: each run stops at its next point and saves itself; again to leave at once"]
     assert [line for line in lines if line not in said] == [*(f"{k:100}" for k in range(2000)), "143"]
-
-
-def test_the_folder_of_a_killed_driver_is_used_again() -> None:
-    with sockets("test-of-sockets") as folder:
-        (folder / "left").touch()
-        with sockets("test-of-sockets") as same:
-            assert same == folder
-            assert list(same.iterdir()) == []
-    assert not folder.exists()
 
 
 # The whole chain
