@@ -8,10 +8,11 @@ import resource
 import stat
 import sys
 import tempfile
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from subprocess import TimeoutExpired
+from typing import Any
 
 import psutil
 import pytest
@@ -75,6 +76,15 @@ def session(cluster: None) -> Iterator[list[psutil.Process]]:
     ray.kill(worker)
 
 
+def of_each(processes: list[psutil.Process], look: Callable[[psutil.Process], Any]) -> list[Any]:
+    """What a look at each process finds; an idle worker may be gone by now."""
+    found = []
+    for process in processes:
+        with suppress(psutil.NoSuchProcess):
+            found.append(look(process))
+    return found
+
+
 def head() -> str:
     """Its address, host:port."""
     return str(ray.get_runtime_context().gcs_address)
@@ -83,9 +93,9 @@ def head() -> str:
 def listeners(processes: list[psutil.Process]) -> dict[tuple[str, int], str]:
     """By address, who listens there."""
     return {
-        (line.laddr.ip.removeprefix("::ffff:"), line.laddr.port): process.name()
-        for process in processes
-        for line in process.net_connections("tcp")
+        (line.laddr.ip.removeprefix("::ffff:"), line.laddr.port): name
+        for name, lines in of_each(processes, lambda process: (process.name(), process.net_connections("tcp")))
+        for line in lines
         if line.status == psutil.CONN_LISTEN
     }
 
@@ -116,7 +126,7 @@ def test_a_session_listens_on_loopback_alone_and_tells_nobody_anything(session: 
 @pytest.mark.ray
 def test_the_token_is_nowhere_to_be_read(session: list[psutil.Process]) -> None:
     token = os.environ["RAY_AUTH_TOKEN"]
-    lines = ["\0".join(process.cmdline()) for process in session]
+    lines = of_each(session, lambda process: "\0".join(process.cmdline()))
     assert not [line for line in lines if token in line]
     logs = Path(ray._private.worker._global_node.get_session_dir_path())
     files = [path for path in logs.rglob("*") if path.is_file() and not path.is_symlink()]
@@ -145,7 +155,7 @@ def test_the_folder_of_a_session_is_its_owners_alone(session: list[psutil.Proces
     assert folder.parent == Path(tempfile.gettempdir())
     status = folder.lstat()
     assert (stat.S_ISDIR(status.st_mode), stat.S_IMODE(status.st_mode), status.st_uid) == (True, 0o700, os.getuid())
-    arguments = [word for process in session for word in process.cmdline()]
+    arguments = [word for line in of_each(session, psutil.Process.cmdline) for word in line]
     assert f"--fallback_directory={logs}" in arguments  # where Ray puts what does not fit into memory
     with another_user():
         for path in (folder, logs, logs / "sockets"):
@@ -309,4 +319,4 @@ def test_only_the_closed_session_starts_ray() -> None:
 
 @pytest.mark.ray
 def test_a_session_opens_fewer_files_than_it_asks_for(session: list[psutil.Process]) -> None:
-    assert max(process.num_fds() for process in session if process.pid != os.getpid()) < FILES
+    assert max(of_each(session[1:], psutil.Process.num_fds)) < FILES
