@@ -34,6 +34,7 @@ TABLES: dict[str, dict[str, type[Any]]] = {  # the configuration of every kind
     "algo": {kind: method.config for kind, method in ALGORITHMS.items()},
 }
 NAMED = 3  # arms that a fault names
+LONGEST = 240  # bytes of a study's name: a file in the work folder is named after it and its profile
 TWIN = "is the same as arm"
 M = TypeVar("M", bound=BaseModel)
 FIELDS = [  # every dotted name of a run's settings
@@ -524,6 +525,21 @@ def _no_profile(profile: str) -> Fault:
 def _plain(name: str) -> bool:
     """Whether a name may be part of a file's."""
     return name.replace("_", "").replace("-", "").isalnum()
+
+
+def study_fault(name: str) -> str:
+    """What is wrong with the name of a study (of a variant: `stem@variant`), or nothing; it becomes part of paths."""
+    stem, at, variant = name.partition("@")
+    if _plain(stem) and (not at or _plain(variant)) and len(name.encode()) <= LONGEST:
+        return ""
+    return f"must be letters, digits, '-' and '_' (of a variant: study@variant), at most {LONGEST} bytes"
+
+
+def arm_fault(name: str) -> str:
+    """What is wrong with the name of an arm, or nothing."""
+    nowhere = Place("")
+    found = _name_faults(name, Node(None, nowhere, nowhere, ""))
+    return found[0].text if found else ""
 
 
 def _variant_faults(variants: Mapping[str, Node], wanted: str | None) -> list[Fault]:

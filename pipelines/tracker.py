@@ -1,7 +1,8 @@
 """Where runs are logged: the protocol, and a twin in memory that obeys it.
 
 A run in a log is named by study, profile, arm and key (spec id and code fingerprint). Starting one that is there
-already continues it. A point that is logged already is not logged again.
+already continues it, unless it came from elsewhere (`Card.imported`): values of two machines do not meet in one run. A
+point that is logged already is not logged again.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -39,6 +40,7 @@ class Card(NamedTuple):
     params: dict[str, str]  # what varies between the runs of the study, and method and seed
     trial: int | None = None  # of a search: then the run stands for all of its seeds
     host: Host = Host()  # that starts it
+    imported: str = ""  # names what a bundle has of it, should it come from one
 
     @property
     def key(self) -> str:
@@ -119,7 +121,11 @@ class Tracker(Protocol):
         ...
 
     def start(self, card: Card) -> RunLog:
-        """Begin a run, or continue it."""
+        """Begin a run, or continue it; one of another origin is dropped, and begun anew."""
+        ...
+
+    def drop(self, ref: str) -> None:
+        """Take a run that is not finished out of the log."""
         ...
 
     def rows(self, refs: Sequence[str], metrics: Collection[str] | None = None) -> list[Row]:
@@ -238,11 +244,19 @@ class MemoryTracker:
         """See `Tracker`."""
         for run in self._mine():
             if (run.card.arm, run.card.key) == (card.arm, card.key):
+                if run.card.imported != card.imported:
+                    self.drop(run.ref)
+                    continue
                 run.status = "running"
                 return run
-        run = MemoryRun(f"run-{len(self.shelf)}", self.study, card)
+        number = 1 + max((int(run.ref.removeprefix("run-")) for run in self.shelf), default=-1)
+        run = MemoryRun(f"run-{number}", self.study, card)
         self.shelf.append(run)
         return run
+
+    def drop(self, ref: str) -> None:
+        """See `Tracker`."""
+        self.shelf[:] = [run for run in self.shelf if run.ref != ref]
 
     def rows(self, refs: Sequence[str], metrics: Collection[str] | None = None) -> list[Row]:
         """See `Tracker`."""
