@@ -38,6 +38,7 @@ from pipelines.tracker import Recorded, StudyCard, Tracker
 
 ARCHIVE = ".zip"
 DESK = "import"
+LINE = 400  # characters of a fault
 
 
 class Packed(NamedTuple):
@@ -203,7 +204,13 @@ def unpack(bundle: Path, home: Path) -> Taken:
                 with place.lock(card.study, card.profile):
                     return _take_in(told, card, place, Stock(files, seals, desk))
     except BundleError as error:
-        raise StoreError(f"{bundle}: {error}") from error
+        raise StoreError(f"{bundle}: {_plain(str(error))}") from error
+
+
+def _plain(text: str) -> str:
+    """A fault as a line: what a bundle or a library brings into it is escaped and cut."""
+    line = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+    return line if len(line) <= LINE else f"{line[:LINE]}…"
 
 
 class Stock(NamedTuple):
@@ -260,8 +267,10 @@ def _log(tracker: Tracker, study: StudyCard, entry: Entry, stock: Stock) -> None
 
 def _goes_further(entry: Entry, home: Home, files: Files) -> bool:
     """Whether a run under way has got further in the bundle than here."""
-    points = [int(Path(name).stem) for name in states_of(files, entry)]
-    return not entry.finished and max(points) > Checkpoints(home.checkpoints(entry.item.key)).points()
+    if entry.finished:
+        return False
+    newest = states_of(files, entry)[-1]
+    return int(Path(newest).stem) > Checkpoints(home.checkpoints(entry.item.key)).points()
 
 
 def _hold(held: ExitStack, home: Home, key: str) -> None:

@@ -120,14 +120,14 @@ def _readable(name: str) -> Iterator[None]:
 
 
 def _check_sizes(sizes: Mapping[str, int]) -> None:
+    if len(sizes) > FILES:
+        raise BundleError(f"{len(sizes):,} files; at most {FILES:,} are taken in")
     missing = [name for name in MOST if name not in sizes]
     if missing:
         raise BundleError(f"not a bundle of `rhmc study export`: no {missing[0]} in it")
     for name, most in MOST.items():
         if sizes[name] > most:
             raise BundleError(f"{name}: {sizes[name]:,} bytes; at most {most:,} are read")
-    if len(sizes) > FILES:
-        raise BundleError(f"{len(sizes):,} files; at most {FILES:,} are taken in")
     if (total := sum(sizes.values())) > UNPACKED:
         raise BundleError(f"{total:,} bytes unpacked; at most {UNPACKED:,} are taken in")
 

@@ -217,7 +217,8 @@ def _first(error: ValidationError) -> str:
     place = "".join(
         f"{part if str(part).isidentifier() else show(part)}: " for part in detail["loc"] if part != "[key]"
     )
-    rule = str(detail.get("ctx", {}).get("error", "")) or detail["msg"].replace("Input should", "must")
+    own = detail["type"] == "value_error"  # a rule of ours
+    rule = str(detail["ctx"]["error"]) if own else detail["msg"].replace("Input should", "must")
     rule = rule[:1].lower() + rule[1:]
     if detail["type"] in ("missing", "extra_forbidden") or not detail["loc"]:
         return place + rule
@@ -268,12 +269,19 @@ def _check_unfolded(name: str, column: str, texts: pa.ChunkedArray) -> None:
 
 
 def _runs(table: pa.Table) -> list[Run]:
-    runs = []
+    runs: list[Run] = []
+    seen: set[tuple[str, int]] = set()
     for at, row in enumerate(table.to_pylist()):
         try:
             runs.append(Run.model_validate(row, strict=True))
         except ValidationError as error:
             raise BundleError(f"{bundle_files.RUNS}: row {at}: {_first(error)}") from error
+        place = (runs[-1].arm, runs[-1].seed)
+        if place in seen:
+            raise BundleError(
+                f"{bundle_files.RUNS}: row {at}: {show(place[0])} s{place[1]} is there twice; once is allowed"
+            )
+        seen.add(place)
     return runs
 
 
@@ -350,6 +358,8 @@ def _spec(where: str, config: str) -> RunSpec:
         raise BundleError(f"{where}: config: {_first(error)}") from error
     except NO_SPEC as error:
         raise BundleError(f"{where}: config: no settings that this code knows ({one_line(error)})") from error
+    if not isinstance(spec.algo, Frozen):  # nothing but a mapping is made a configuration of its kind
+        raise BundleError(f"{where}: config: algo: {show(spec.algo)} is not allowed; must be a mapping")
     numbers = {name: value for name, value in flatten(spec.model_dump()).items() if isinstance(value, float)}
     if astray := [name for name, value in numbers.items() if not math.isfinite(value)]:
         raise BundleError(f"{where}: config: {astray[0]}: {numbers[astray[0]]} is not allowed; must be a finite number")
@@ -412,17 +422,12 @@ def grid_size(cfg: Config) -> int:
 
 
 def _check_whole(about: Manifest, entries: Sequence[Entry], files: Files) -> None:
-    """No run twice, all of the plan, and their files without any other."""
-    seen: set[tuple[str, int]] = set()
+    """All runs of the plan, and their files without any other."""
     arms, plan = set(about.arms), set(about.plan)
     for at, entry in enumerate(entries):
-        where, card = f"{bundle_files.RUNS}: row {at}", entry.item.card
-        place = (card.arm, card.seed)
-        if place in seen:
-            raise BundleError(f"{where}: {show(card.name)} is there twice; once is allowed")
         if plan and entry.place not in plan:
-            raise BundleError(f"{where}: {show(card.name)} is not in the plan of {MANIFEST}")
-        seen.add(place)
+            name = show(entry.item.card.name)
+            raise BundleError(f"{bundle_files.RUNS}: row {at}: {name} is not in the plan of {MANIFEST}")
     if unknown := [arm for arm, _ in about.plan if arm not in arms]:
         raise BundleError(f"{MANIFEST}: plan: {show(unknown[0])} is not among the arms")
     _check_files(entries, [name for name in files.sizes if name not in bundle_files.MOST])
