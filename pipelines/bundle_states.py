@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from pipelines.bundle_files import BundleError, Files
-from pipelines.bundle_rows import Entry, metric_fault, on_grid
+from pipelines.bundle_rows import Entry, metric_fault, on_grid, shown
 from pipelines.document import show
 from pipelines.errors import InputError
 from pipelines.plan import resolved_yaml
@@ -122,10 +122,11 @@ def _check_progress(name: str, point: str, state: dict[str, Any], entry: Entry) 
     if not (isinstance(trainer, dict) and trainer.keys() == TRAINER and isinstance(history, list)):
         raise BundleError(f"{name}: not a checkpoint of a run under way; it has trainer, history and seconds")
     cfg, done = entry.item.spec.trainer, int(point)
-    if not _real(seconds) or not 0 < done == len(history) <= cfg.evaluations + 1 or trainer["point"] != done - 1:
+    told = _real(seconds) and _real(trainer["point"]) and trainer["point"] == done - 1
+    if not told or not 0 < done == len(history) <= cfg.evaluations + 1:
         raise BundleError(f"{name}: has not the {done} points of its name")
-    if trainer["step"] != grid_step(cfg, done - 1):
-        raise BundleError(f"{name}: step {show(trainer['step'])} is not allowed; must be {grid_step(cfg, done - 1):,}")
+    if not _real(trainer["step"]) or trainer["step"] != grid_step(cfg, done - 1):
+        raise BundleError(f"{name}: step {shown(trainer['step'])} is not allowed; must be {grid_step(cfg, done - 1):,}")
     for values in history:
         if fault := _history_fault(values, entry):
             raise BundleError(f"{name}: history: {fault}")
@@ -138,8 +139,8 @@ def _history_fault(values: Any, entry: Entry) -> str:
     if step < 0 or step != int(step) or not on_grid(entry.item.spec.trainer, int(step)):
         return f"step {step} is not allowed; must be on the run's grid"
     for metric, value in values.items():
-        if not _real(value):
-            return f"{show(metric)} at step {step:.0f} must be a finite number"
+        if not isinstance(metric, str) or not _real(value):
+            return f"{shown(metric)} at step {step:.0f} must be a finite number"
         if metric != "step" and (fault := metric_fault(metric)):
             return f"{show(metric)} is not allowed; {fault}"
     return ""

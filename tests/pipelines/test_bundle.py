@@ -495,6 +495,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], Any], str]] = {
     "larger than any": (put("bundle.json", b" " * 2**23), ABOUT + "8,388,608 bytes; at most 4,194,304"),
     "a later format": (about(format=4), "a bundle of format 4; this version reads 2 and 3"),
     "a format in words": (about(format="3"), ABOUT + "format: '3' is not allowed; must be 2 or 3"),
+    "a list for a number": (about(format=[None]), ABOUT + r"format: \[null\] is not allowed; must be 2 or 3"),
     "true for a number": (about(format=True), ABOUT + "format: true is not allowed; must be 2 or 3"),
     "a study outside": (about(study="../../x"), ABOUT + r"study: '\.\./\.\./x' is not allowed; .*must be letters"),
     "no study": (about(study=""), ABOUT + "study: '' is not allowed; must be letters"),
@@ -617,6 +618,18 @@ DAMAGE: dict[str, tuple[Callable[[Path], Any], str]] = {
     "a checkpoint at no step": (
         state(lambda s: s["trainer"].update(step="\x1b"), "checkpoints/*/*.pt"),
         CHECKPOINT + r"step '\\x1b' is not allowed; must be 0",
+    ),
+    "a checkpoint whose point is a tensor": (
+        state(lambda s: s["trainer"].update(point=torch.zeros(2)), "checkpoints/*/*.pt"),
+        CHECKPOINT + "has not the 1 points of its name",
+    ),
+    "a checkpoint whose step is a list": (
+        state(lambda s: s["trainer"].update(step=[torch.zeros(2)]), "checkpoints/*/*.pt"),
+        CHECKPOINT + "step .*Tensor.* is not allowed; must be 0",
+    ),
+    "a checkpoint with a number for a metric": (
+        state(lambda s: s["history"][0].update({7: 1.0}), "checkpoints/*/*.pt"),
+        CHECKPOINT + "history: 7 at step 0 must be a finite number",
     ),
     "a checkpoint with a past that is no number": (
         state(lambda s: s["history"][0].update({"eval/return": float("nan")}), "checkpoints/*/*.pt"),
@@ -794,7 +807,7 @@ def test_an_archive_that_a_person_made_of_the_folder(bundle: Path, there: Path) 
 
 def test_more_files_or_bytes_than_are_taken_in(bundle: Path, there: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     archive = zipped(bundle)
-    for name, most, said in (("FILES", 5, "7 files; at most 5"), ("UNPACKED", 9999, "bytes unpacked; at most 9,999")):
+    for name, most, said in (("FILES", 5, "[67] files; at most 5"), ("UNPACKED", 9999, "unpacked; at most 9,999")):
         with monkeypatch.context() as patch:
             patch.setattr(bundle_files, name, most)
             for kind in (bundle, archive):
