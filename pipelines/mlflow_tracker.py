@@ -27,7 +27,7 @@ from pipelines.errors import InputError
 from pipelines.host import Host
 from pipelines.sqlite import address, connect, connecting, reading_address, settle, sqlite_file
 from pipelines.store import Home, StoreError, one_line, replace_durably, sync
-from pipelines.tracker import IMPORTED, VALUES_ONLY, Card, Recorded, Row, Status, StudyCard, unseen
+from pipelines.tracker import VALUES_ONLY, Card, Recorded, Row, Status, StudyCard, unseen
 from rhmc.types import Metrics
 
 os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
@@ -248,6 +248,9 @@ class MlflowTracker:
         query = f"tags.role = 'run' and tags.spec = '{card.spec_id}' and tags.fingerprint = '{card.fingerprint}'"
         with explained(self.uri):
             run = self._only(query, card.name, self._tags(card), card.arm)
+            if run.data.tags.get("imported", "") != card.imported:
+                self.drop(run.info.run_id)
+                run = self._only(query, card.name, self._tags(card), card.arm)
             ref = run.info.run_id
             if run.info.status != STATUS["running"]:
                 self.client.update_run(ref, STATUS["running"])
@@ -258,6 +261,13 @@ class MlflowTracker:
                 self.client.log_batch(ref, params=new)
             seen = {(row.metric, row.step) for row in self.rows([ref])} if run.data.metrics else set()
         return MlflowRun(self, card, ref, seen)
+
+    def drop(self, ref: str) -> None:
+        """See `Tracker`. The run lies among MLflow's deleted ones; its model is no longer offered."""
+        with explained(self.uri):
+            for version in self.client.search_model_versions(f"run_id = '{ref}'"):
+                self.client.delete_model_version(version.name, version.version)
+            self.client.delete_run(ref)
 
     def _tags(self, card: Card) -> dict[str, str]:
         return (
@@ -274,6 +284,7 @@ class MlflowTracker:
                 "commit": card.commit,
             }
             | {name: value for name, value in card.host._asdict().items() if value}
+            | ({"imported": card.imported} if card.imported else {})
         )
 
     def rows(self, refs: Sequence[str], metrics: Collection[str] | None = None) -> list[Row]:
@@ -579,7 +590,7 @@ def _recorded(ref: str, status: str, tags: Mapping[str, str]) -> Recorded:
     known: dict[str, str] = defaultdict(str, tags)
     key = f"{known['spec']}-{known['fingerprint']}"
     stale, host = views.STALE in tags, Host(known["machine"], known["versions"])
-    without = known[IMPORTED] == VALUES_ONLY
+    without = VALUES_ONLY in tags
     return Recorded(
         *(ref, known["variant"], key, FROM_MLFLOW[status], known["commit"], stale, host, known["error"], without)
     )

@@ -11,7 +11,7 @@ from pipelines.policy import CONFIG, FILE
 from pipelines.progress import Board
 from pipelines.render import EPISODE, WHY_NOT
 from pipelines.store import Checkpoints, Home
-from pipelines.tracker import IMPORTED, VALUES_ONLY, Recorded, RunLog, Status, StudyCard, Tracker, points_of
+from pipelines.tracker import VALUES_ONLY, Recorded, RunLog, Status, StudyCard, Tracker, points_of
 from rhmc.trainer import grid_step
 from rhmc.types import Metrics
 
@@ -100,7 +100,7 @@ class Recorder:
                 if self.tracker.file(source, FILE, Path(folder)):
                     keep(log, Path(folder))
                 else:
-                    log.tag(IMPORTED, VALUES_ONLY)
+                    log.tag(VALUES_ONLY, "yes")
             log.tag("reused_from", source)
             log.finish("finished")
             self.overview.points(item.card.arm, item.key, points)

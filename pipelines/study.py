@@ -18,7 +18,7 @@ from typing import Annotated, Any, Generic, Literal, NamedTuple, Self, TypeVar
 from pydantic import BaseModel, Field, field_validator
 
 from pipelines.document import Fault, Node, Place, Unreadable, choices, join, merge, override, read, show, validate
-from pipelines.errors import InputError
+from pipelines.errors import InputError, seen
 from pipelines.grid import MOST, Point, nested, points, replaced
 from pipelines.include import included
 from pipelines.names import ARM, PROFILES, alike, fault_of_study, simple, study_name, too_long
@@ -537,6 +537,22 @@ def _crowded(root: Node) -> list[Fault]:
         for key, count in found.items()
         if count > most[key]
     ]
+
+
+def study_fault(name: str) -> str:
+    """What is wrong with the name of a study (of a variant: `stem@variant`), or nothing; it becomes part of paths."""
+    stem, at, variant = name.partition("@")
+    fault = fault_of_study(stem) or too_long(name)
+    return fault or ("a variant is named with letters, digits, '-' and '_' only" if at and not simple(variant) else "")
+
+
+def arm_fault(name: str) -> str:
+    """What is wrong with the name of an arm, or nothing."""
+    if not all(map(seen, name)):
+        return f"{show(name)} is no name for an arm; it has characters that cannot be seen"
+    arm = Node(None, Place(""), Place(""), "")
+    found = _name_faults(name, arm) or ([_long_name(name, arm)] if len(name) > ARM else [])
+    return found[0].text if found else ""
 
 
 def _variant_faults(path: Path, variants: Mapping[str, Node], wanted: str | None) -> list[Fault]:

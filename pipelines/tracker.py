@@ -1,7 +1,8 @@
 """Where runs are logged: the protocol, and a twin in memory that obeys it.
 
 A run in a log is named by study, profile, arm and key (spec id and code fingerprint). Starting one that is there
-already continues it. A point that is logged already is not logged again.
+already continues it, unless it came from elsewhere (`Card.imported`): values of two machines do not meet in one run. A
+point that is logged already is not logged again.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -13,7 +14,7 @@ from typing import Literal, NamedTuple, Protocol
 from pipelines.host import Host
 from rhmc.types import Metrics
 
-IMPORTED, VALUES_ONLY = "imported", "values only"  # the tag of a run from a bundle, and its value without a policy
+VALUES_ONLY = "values_only"  # tag of a run that came from a bundle without its policy
 Status = Literal["running", "finished", "failed", "interrupted"]
 
 
@@ -40,6 +41,7 @@ class Card(NamedTuple):
     params: dict[str, str]  # what varies between the runs of the study, and method and seed
     trial: int | None = None  # of a search: then the run stands for all of its seeds
     host: Host = Host()  # that starts it
+    imported: str = ""  # names what a bundle has of it, should it come from one
 
     @property
     def key(self) -> str:
@@ -122,7 +124,11 @@ class Tracker(Protocol):
         ...
 
     def start(self, card: Card) -> RunLog:
-        """Begin a run, or continue it."""
+        """Begin a run, or continue it; one of another origin is dropped, and begun anew."""
+        ...
+
+    def drop(self, ref: str) -> None:
+        """Take a run that is not finished out of the log."""
         ...
 
     def rows(self, refs: Sequence[str], metrics: Collection[str] | None = None) -> list[Row]:
@@ -233,7 +239,7 @@ class MemoryTracker:
                 "stale" in r.tags,
                 r.card.host,
                 r.tags.get("error", ""),
-                r.tags.get(IMPORTED) == VALUES_ONLY,
+                VALUES_ONLY in r.tags,
             )
             for r in self._mine()
         ]
@@ -255,11 +261,19 @@ class MemoryTracker:
         """See `Tracker`."""
         for run in self._mine():
             if (run.card.arm, run.card.key) == (card.arm, card.key):
+                if run.card.imported != card.imported:
+                    self.drop(run.ref)
+                    continue
                 run.status = "running"
                 return run
-        run = MemoryRun(f"run-{len(self.shelf)}", self.study, card)
+        number = 1 + max((int(run.ref.removeprefix("run-")) for run in self.shelf), default=-1)
+        run = MemoryRun(f"run-{number}", self.study, card)
         self.shelf.append(run)
         return run
+
+    def drop(self, ref: str) -> None:
+        """See `Tracker`."""
+        self.shelf[:] = [run for run in self.shelf if run.ref != ref]
 
     def rows(self, refs: Sequence[str], metrics: Collection[str] | None = None) -> list[Row]:
         """See `Tracker`."""

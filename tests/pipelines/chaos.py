@@ -30,6 +30,8 @@ from sqlalchemy.engine import Engine
 from werkzeug.serving import WSGIRequestHandler, make_server
 
 from pipelines import ray_driver, run
+from pipelines.bundle import unpack
+from pipelines.errors import InputError
 from pipelines.mlflow_tracker import open_existing
 from pipelines.names import full
 from pipelines.plan import study_card
@@ -179,6 +181,14 @@ def launch(study: Study, home: Path, length: int = FOREVER, room: int | None = N
     return process.exitcode
 
 
+def import_in_a_process(bundle: Path, home: Path, length: int = FOREVER, room: int | None = None) -> int:
+    """The exit code of a process that takes in a bundle; see `start_launch`."""
+    process = start(_import, str(bundle), str(home), length, room)
+    process.join()
+    assert process.exitcode is not None
+    return process.exitcode
+
+
 def start(target: Any, *args: Any) -> ForkServerProcess:
     """Fork a process."""
     FORKS.set_forkserver_preload([__name__, *PRELOAD])
@@ -202,6 +212,20 @@ def _drive(study: str, home: str, uri: str | None, length: int, room: int | None
     status = run.run_studies([Study.model_validate_json(study)], Path(home))
     (Path(home) / "writes").write_text(str(fuse.count))
     sys.exit(status)
+
+
+def _import(bundle: str, home: str, length: int, room: int | None) -> None:
+    _settle(Path(home) / "driver.log")
+    if room:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (room, room))
+    fuse = Fuse(length)
+    fuse.lay(home)
+    try:
+        unpack(Path(bundle), Path(home))
+    except InputError as error:
+        print(error)
+        sys.exit(2)
+    (Path(home) / "writes").write_text(str(fuse.count))
 
 
 def _settle(log: Path) -> None:

@@ -233,7 +233,7 @@ def test_what_travels_is_refused_in_one_line(rhmc: Rhmc, tmp_path: Path) -> None
     assert said == (2, "", "x (quick): no run is finished or under way; nothing to export\n")
     said = rhmc("study", "import", "b.zip")
     assert (said.code, said.out, said.err.count("\n")) == (2, "", 1)
-    assert said.err.startswith("b.zip: not a bundle of `rhmc study export`")
+    assert said.err.startswith("b.zip: cannot be read: No such file or directory")
     assert not (tmp_path / "work").exists()
 
 
