@@ -17,6 +17,7 @@ from typing import Annotated, Any, Generic, Literal, NamedTuple, Self, TypeVar
 
 from pydantic import BaseModel, Field, field_validator
 
+from pipelines import limits
 from pipelines.document import Fault, Node, Place, Unreadable, choices, join, merge, override, read, show, validate
 from pipelines.errors import InputError
 from pipelines.grid import Point, nested, points, replaced
@@ -112,6 +113,7 @@ class Study(Frozen):
     file: str = ""  # as given, for commands that a person can repeat
     overrides: tuple[str, ...] = ()
     variant: str = ""
+    remarks: tuple[str, ...] = ()  # what is allowed and gives nothing: arms whose budget ends before they learn
 
     @classmethod
     def load(
@@ -138,6 +140,7 @@ class Study(Frozen):
         resolved = {name: getattr(getattr(file, name), profile) for name in COUNTS}
         fixed = {"question": file.question.strip(), "resources": file.resources, "profile": profile}
         fixed |= {"file": str(path), "overrides": tuple(overrides), "variant": variant or ""}
+        fixed["remarks"] = tuple(map(str, dict.fromkeys(wanted.remarks)))
         name = Path(path).stem + (f"@{variant}" if variant else "")
         return cls(name=name, base=wanted.base, arms=wanted.arms, **fixed, **resolved)
 
@@ -243,6 +246,7 @@ class Resolved(NamedTuple):
     base: Setting | None
     arms: dict[str, Setting]
     faults: list[Fault]
+    remarks: Sequence[Fault] = ()
 
 
 class Loaded(NamedTuple, Generic[M]):
@@ -402,7 +406,17 @@ def _settings(root: Node, profile: str, variant: str | None, patches: Sequence[N
     faults += [f if f.path.startswith(plain) else _owned(f, names) for f, names in owners.items()]
     kept, found = _kept(root, chosen)
     arms = {name: arm for name, arm in arms.items() if kept is None or planned[name][0] in kept}
-    return Resolved(base, arms, faults + found)
+    return Resolved(base, arms, faults + found, _unlearned(arms, steps) if steps else [])
+
+
+def _unlearned(arms: Mapping[str, Setting], steps: Node) -> list[Fault]:
+    """Arms whose budget ends before they learn, at its place."""
+    from pipelines.budget import shortfall  # which knows settings
+
+    owners: dict[str, list[str]] = {}
+    for name, setting in arms.items():
+        owners.setdefault(shortfall(setting), []).append(name)
+    return [_owned(Fault(steps.place, steps.path, text), names) for text, names in owners.items() if text]
 
 
 def _planned(
@@ -468,7 +482,7 @@ def _setting(layers: Sequence[Node], steps: Node | None) -> tuple[Setting | None
 
 def _misfit(setting: Setting, layers: Sequence[Node]) -> list[Fault]:
     """A method that cannot act in its task, at the place of the task's field that it cannot do with."""
-    text = trainer.misfit(setting.env, setting.algo)
+    text = trainer.misfit(setting.env, setting.algo) or limits.misfit(setting.env, setting.algo)
     if not text:
         return []
     field, _, fault = text.partition(": ")
@@ -504,7 +518,7 @@ def _trainer(node: Node, steps: Node | None) -> tuple[BaseModel | None, list[Fau
         written = children.pop("steps")
         text = "a study's budget is the same for every run; write it as 'steps' at the top of the file"
         faults.append(Fault(written.key, written.path, text))
-    if steps and isinstance(steps.value, int) and steps.value >= 1:
+    if steps and isinstance(steps.value, int) and 1 <= steps.value <= limits.BOUNDS["steps"]:
         children["steps"] = steps
     config, found = validate(trainer.Config, node._replace(value=children), hidden=("steps",))
     return config, faults + found

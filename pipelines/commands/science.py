@@ -8,11 +8,14 @@ import typer
 
 from pipelines.commands.common import Profile, folder_option, table
 from pipelines.errors import InputError
+from pipelines.limits import EPISODES, SEED
 
 
 def theorem(
-    instances: Annotated[int, typer.Option(min=1, help="Random instances per size and density.")] = 20_000,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    instances: Annotated[
+        int, typer.Option(min=1, max=EPISODES, help="Random instances per size and density.")
+    ] = 20_000,
+    seed: Annotated[int, typer.Option(min=0, max=SEED)] = 0,
     alpha: Annotated[float, typer.Option(min=0, max=1, help="The penalty of Eq. 6.")] = 0.1,
     out: Annotated[Path | None, typer.Option(help="Also write theorem.parquet in this folder.")] = None,
 ) -> None:
