@@ -266,8 +266,8 @@ def test_the_check_names_the_arms_and_the_least_budget(file: Path) -> None:
     assert done.exit_code == 0
     notes = [line for line in done.stdout.splitlines() if line.startswith("note: ")]
     assert notes == [
-        f"note: {file}:16:8: steps: 3,200 steps end before 'mappo' learns; must be at least 3,216 (rollout 201 x "
+        f"note: {file}:15:8: steps: 3,200 steps end before 'mappo' learns; must be at least 3,216 (rollout 201 x "
         "num_envs 16) (in arm 'b')",
-        f"note: {file}:16:8: steps: 3,200 steps end before 'rhmc' learns; must be at least 4,064 (warmup 4,000 + "
+        f"note: {file}:15:8: steps: 3,200 steps end before 'rhmc' learns; must be at least 4,064 (warmup 4,000 + "
         "steps_per_update 64) (in arm 'c')",
     ]
