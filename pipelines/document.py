@@ -8,7 +8,7 @@ import difflib
 import enum
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -20,6 +20,7 @@ from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import MappingNode, ScalarNode
 from ruamel.yaml.nodes import Node as YamlNode
 
+from pipelines import limits
 from pipelines.errors import seen
 
 LIMIT = 1_000_000  # bytes; larger is no study
@@ -29,6 +30,7 @@ NODES = 10_000  # keys and values; a thousand arms have fewer, and more takes th
 KEY = 200  # characters of a key
 SHOWN = 60  # characters of an offending value
 LISTED = 50  # names that are offered
+BY_PROFILE = ("quick", "paper")  # keys of a mapping that holds a number for each profile
 PLAIN_TAGS = ("tag:yaml.org,2002:map", "tag:yaml.org,2002:seq")
 
 M = TypeVar("M", bound=BaseModel)
@@ -296,10 +298,35 @@ def validate(model: type[M], node: Node, hidden: tuple[str, ...] = ()) -> tuple[
     Strict: no text for a number, no `true` for 1.
     """
     try:
-        return model.model_validate_json(json.dumps(plain(node)), strict=True), []
+        found, faults = model.model_validate_json(json.dumps(plain(node)), strict=True), list[Fault]()
     except ValidationError as error:
-        faults = [_fault(model, node, detail, hidden) for detail in error.errors()]
-        return None, [fault for fault in faults if fault]
+        found, faults = None, [f for detail in error.errors() if (f := _fault(model, node, detail, hidden))]
+    known = {fault.path for fault in faults}
+    beyond = [fault for fault in _beyond(model, node) if fault.path not in known]
+    return (None if beyond else found), faults + beyond
+
+
+def _beyond(model: type[BaseModel], node: Node, name: str = "") -> Iterator[Fault]:
+    """Values that no field may have (`limits`); `name` is that of a mapping whose keys are no names of fields."""
+    for key, child in node.children.items():
+        if key not in model.model_fields:
+            continue
+        inner, field = _inner(model.model_fields[key].annotation), name or key
+        if inner is not None:
+            yield from _beyond(inner, child, "" if set(inner.model_fields) - set(BY_PROFILE) else key)
+            continue
+        for value in _leaves(child):
+            if rule := limits.beyond(field, value.value):
+                yield Fault(value.place, value.path, f"{show(value.value)} is not allowed; {rule}")
+
+
+def _leaves(node: Node) -> Iterator[Node]:
+    """A value, or those in a list."""
+    if isinstance(node.value, list):
+        for child in node.value:
+            yield from _leaves(child)
+    elif not isinstance(node.value, dict):
+        yield node
 
 
 def _fault(model: type[BaseModel], root: Node, error: ErrorDetails, hidden: tuple[str, ...]) -> Fault | None:

@@ -32,7 +32,7 @@ def check(point: Metrics, state: State) -> None:
 
     Args:
         point: metrics with their `step`.
-        state: of a `Trainer` or `Seeds`. What was kept to learn from is passed over: it shows in the metrics.
+        state: of a training or of parts of it. What was kept to learn from is passed over: it shows in the metrics.
 
     Raises:
         DivergedError: the first value that is not, metrics before weights.

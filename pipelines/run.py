@@ -1,12 +1,13 @@
 """Launch studies: what their plans still lack goes through Ray Tune, results go to the log as they come."""
 
 import json
+import os
 import shlex
 import shutil
 import signal
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import FrameType
@@ -18,6 +19,7 @@ from pipelines.addresses import without_password
 from pipelines.errors import InputError, visible
 from pipelines.fingerprint import fingerprint
 from pipelines.host import Host, host
+from pipelines.limits import absent
 from pipelines.origin import another, remember
 from pipelines.plan import Item, commit, finished, given_twice, items, study_card
 from pipelines.progress import Board, board, print_table
@@ -51,10 +53,21 @@ def run_studies(studies: Sequence[Study], home: Path) -> int:
     Raises:
         InputError: the studies cannot be launched together.
     """
-    if faults := list(_apart(studies)):
+    devices = {arm.trainer.device: f"{one.name} / {name}" for one in studies for name, arm in one.arms.items()}
+    if faults := [*_apart(studies), *missing_devices(devices.items())]:
         raise InputError(*faults)
+    for remark in (remark for study in studies for remark in study.remarks):
+        print(f"note: {remark}", file=sys.stderr)
     names = [(study.name, study.profile) for study in studies]
     return guarded(home, names, lambda place, interrupts: _launch(studies, place, interrupts))
+
+
+def missing_devices(where: Iterable[tuple[str, str]]) -> Iterator[str]:
+    """Devices, each with who asks for it, that are not here; what a cluster has is its nodes' business."""
+    if os.environ.get("RAY_ADDRESS", "local") not in ("", "local"):
+        return
+    for device, who in dict(where).items():
+        yield from (f"trainer.device ({who}): {text}" for text in absent([device]))
 
 
 def _apart(studies: Sequence[Study]) -> Iterator[str]:

@@ -171,6 +171,7 @@ class Search(Frozen):
     file: str
     sha256: str  # of the file
     overrides: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()  # as a study's
 
     @classmethod
     def load(cls, path: Path | str, profile: str = "quick", overrides: Sequence[str] = ()) -> Self:
@@ -189,9 +190,10 @@ class Search(Frozen):
         file = loaded.file
         counts = {name: getattr(getattr(file, name), profile) for name in COUNTS}
         parts = {name: getattr(file, name) for name in ("sampler", "pruner", "resources")}
-        names = {"name": study_name(path), "profile": profile, "file": str(path), "overrides": tuple(overrides)}
+        names = {"name": study_name(path), "profile": profile, "file": str(path)}
+        told = {"overrides": tuple(overrides), "remarks": tuple(map(str, dict.fromkeys(loaded.wanted.remarks)))}
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
-        return cls(question=file.question.strip(), arms=arms, sha256=digest, **names, **counts, **parts)
+        return cls(question=file.question.strip(), arms=arms, sha256=digest, **names, **told, **counts, **parts)
 
     def seed_list(self) -> list[int]:
         """The seeds of every trial."""

@@ -19,14 +19,14 @@ from rich.console import Console
 from ruamel.yaml import YAML
 
 from pipelines.addresses import without_password
-from pipelines.errors import visible
+from pipelines.errors import InputError, visible
 from pipelines.fingerprint import fingerprint
 from pipelines.found import file_name, stem, winner_yaml, write_text
 from pipelines.origin import another, remember
 from pipelines.plan import commit
 from pipelines.progress import Board, StopFile, board, print_table
 from pipelines.ray_settings import set_up_ray
-from pipelines.run import BAD, DONE, FAILED, Interrupts, guarded
+from pipelines.run import BAD, DONE, FAILED, Interrupts, guarded, missing_devices
 from pipelines.search import Search
 from pipelines.store import Checkpoints, Home, StoreError
 from pipelines.tracker import Card, RunLog, Status, StudyCard, Tracker
@@ -73,6 +73,11 @@ def run_search(search: Search, home: Path, out: Path | None = None) -> int:
             assert storage is not None
             return _launch(search, place, storage, out or found_folder(search, place), interrupts)
 
+    devices = {arm.setting.trainer.device: name for name, arm in search.arms.items()}
+    if faults := list(missing_devices(devices.items())):
+        raise InputError(*faults)
+    for remark in search.remarks:
+        print(f"note: {remark}", file=sys.stderr)
     return guarded(home, [(search.name, search.profile)], launch)
 
 

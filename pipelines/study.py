@@ -17,6 +17,7 @@ from typing import Annotated, Any, Generic, Literal, NamedTuple, Self, TypeVar
 
 from pydantic import BaseModel, Field, field_validator
 
+from pipelines import limits
 from pipelines.document import Fault, Node, Place, Unreadable, choices, join, merge, override, read, show, validate
 from pipelines.errors import InputError, seen
 from pipelines.grid import MOST, Point, nested, points, replaced
@@ -113,6 +114,7 @@ class Study(Frozen):
     file: str = ""  # as given, for commands that a person can repeat
     overrides: tuple[str, ...] = ()
     variant: str = ""
+    remarks: tuple[str, ...] = ()  # what is allowed and gives nothing: arms whose budget ends before they learn
 
     @classmethod
     def load(
@@ -140,6 +142,7 @@ class Study(Frozen):
         fixed = {"question": file.question.strip(), "resources": file.resources, "profile": profile}
         fixed |= {"file": str(path), "overrides": tuple(overrides), "variant": variant or ""}
         name = study_name(Path(path), variant or "")
+        fixed["remarks"] = tuple(map(str, dict.fromkeys(wanted.remarks)))
         return cls(name=name, base=wanted.base, arms=wanted.arms, **fixed, **resolved)
 
     def runs(self) -> list[PlannedRun]:
@@ -244,6 +247,7 @@ class Resolved(NamedTuple):
     base: Setting | None
     arms: dict[str, Setting]
     faults: list[Fault]
+    remarks: Sequence[Fault] = ()
 
 
 class Loaded(NamedTuple, Generic[M]):
@@ -405,7 +409,17 @@ def _settings(root: Node, profile: str, variant: str | None, patches: Sequence[N
     faults += [f if f.path.startswith(plain) else _owned(f, names) for f, names in owners.items()]
     kept, found = _kept(root, chosen)
     arms = {name: arm for name, arm in arms.items() if kept is None or planned[name][0] in kept}
-    return Resolved(base, arms, faults + found)
+    return Resolved(base, arms, faults + found, _unlearned(arms, steps) if steps else [])
+
+
+def _unlearned(arms: Mapping[str, Setting], steps: Node) -> list[Fault]:
+    """Arms whose budget ends before they learn, at its place."""
+    from pipelines.budget import shortfall  # which knows settings
+
+    owners: dict[str, list[str]] = {}
+    for name, setting in arms.items():
+        owners.setdefault(shortfall(setting), []).append(name)
+    return [_owned(Fault(steps.place, steps.path, text), names) for text, names in owners.items() if text]
 
 
 def _planned(
@@ -474,7 +488,7 @@ def _setting(layers: Sequence[Node], steps: Node | None) -> tuple[Setting | None
 
 def _misfit(setting: Setting, layers: Sequence[Node]) -> list[Fault]:
     """A method that cannot act in its task, at the place of the task's field that it cannot do with."""
-    text = trainer.misfit(setting.env, setting.algo)
+    text = trainer.misfit(setting.env, setting.algo) or limits.misfit(setting.env, setting.algo)
     if not text:
         return []
     field, _, fault = text.partition(": ")
@@ -510,7 +524,7 @@ def _trainer(node: Node, steps: Node | None) -> tuple[BaseModel | None, list[Fau
         written = children.pop("steps")
         text = "a study's budget is the same for every run; write it as 'steps' at the top of the file"
         faults.append(Fault(written.key, written.path, text))
-    if steps and isinstance(steps.value, int) and steps.value >= 1:
+    if steps and isinstance(steps.value, int) and 1 <= steps.value <= limits.BOUNDS["steps"]:
         children["steps"] = steps
     config, found = validate(trainer.Config, node._replace(value=children), hidden=("steps",))
     return config, faults + found

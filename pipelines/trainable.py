@@ -19,6 +19,7 @@ from pipelines.policy import FILE, SPEC, Saved
 from pipelines.seeds import Seeds
 from pipelines.store import Checkpoints, StoreError, one_line, save_atomically, without_replay
 from pipelines.study import RunSpec
+from rhmc.learner import Learners
 from rhmc.trainer import Trainer
 from rhmc.types import Metrics, State
 
@@ -120,11 +121,12 @@ class RunTrainable(Trainable):
         self.seconds += spent
         timing = {"time/seconds": self.seconds, "time/steps_per_second": (trainer.step - before) / spent}
         point = defined(metrics)
-        check(point, trainer.state_dict())  # before anything is kept: neither checkpoint nor policy is spoilt
+        check(point, {"learners": [one.state_dict() for one in learners(trainer)]})
         self.history.append(point | timing)
 
     def _save(self, trainer: Trainer | Seeds) -> None:
         state = self.state()
+        check({"step": float(trainer.step)}, state["trainer"])  # the rest of it, such as statistics of rewards
         if trainer.done:  # also where nothing is left to train: the file that a killed worker left may be damaged
             state["trainer"] = without_replay(state["trainer"])  # nothing more is learned from it
             kept = state["trainer"] | {SPEC: self.job["spec"]}
@@ -178,6 +180,12 @@ class RunTrainable(Trainable):
         """Let go of the run."""
         self.trainer = None
         self.lock.release()
+
+
+def learners(trainer: Trainer | Seeds) -> Learners:
+    """Every network that learns, of all seeds."""
+    each = trainer.trainers.values() if isinstance(trainer, Seeds) else [trainer]
+    return [learner for one in each for learner in one.algorithm.learners()]
 
 
 def ending(*, stopped: bool = False, **more: Any) -> dict[str, Any]:

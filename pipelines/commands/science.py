@@ -7,12 +7,15 @@ import typer
 
 from pipelines.commands.common import Profile, folder_option, profile_faults, say, table, tell
 from pipelines.errors import InputError, visible_lines
+from pipelines.limits import EPISODES, SEED
 from pipelines.names import PROFILES, fault_of_study, simple, study_name
 
 
 def theorem(
-    instances: Annotated[int, typer.Option(min=1, help="Random instances per size and density.")] = 20_000,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    instances: Annotated[
+        int, typer.Option(min=1, max=EPISODES, help="Random instances per size and density.")
+    ] = 20_000,
+    seed: Annotated[int, typer.Option(min=0, max=SEED)] = 0,
     alpha: Annotated[float, typer.Option(min=0, max=1, help="The penalty of Eq. 6.")] = 0.1,
     out: Annotated[Path | None, typer.Option(help="Also write theorem.parquet in this folder.")] = None,
 ) -> None:

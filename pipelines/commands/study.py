@@ -1,6 +1,7 @@
 """`rhmc study`: check, run, follow and move studies; `rhmc export` for the report."""
 
 import shlex
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -45,6 +46,8 @@ def check(file: File, profile: Profile = "quick", variant: Variant = None, overr
     table(["arm", "differs in", "seeds", "steps", "copies"], rows, numbers=("seeds", "steps", "copies"))
     runs = len(study.arms) * study.seeds
     say(f"{runs} runs, {runs * study.steps:,} environment steps in all, {study.resources.concurrent} runs at a time")
+    for remark in study.remarks:
+        say(f"note: {remark}")
 
 
 @app.command("run")

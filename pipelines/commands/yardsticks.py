@@ -9,6 +9,7 @@ import typer
 
 from pipelines.commands.common import DONE, Json, Profile, folder_option, profile_faults, say_json, table, tell
 from pipelines.errors import InputError
+from pipelines.limits import EPISODES, JOBS, SEED
 
 if TYPE_CHECKING:
     from pipelines.yardsticks import Scored
@@ -42,11 +43,11 @@ def verb(name: str) -> Callable[[Callable[..., Fields]], Callable[..., None]]:
 def _score(
     kind: str,
     fields: Fields,
-    episodes: Annotated[int, typer.Option(min=2, help="Episodes of the bank.")] = 1000,
+    episodes: Annotated[int, typer.Option(min=2, max=EPISODES, help="Episodes of the bank.")] = 1000,
     policies: Annotated[
         str | None, typer.Option(help="Names with commas between; all but the planner if not given.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Names the bank of episodes.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=SEED, help="Names the bank of episodes.")] = 0,
     as_json: Json = False,
     out: Annotated[
         Path | None, typer.Option(help="Also write yardsticks.parquet there, beside the runs' tables.")
@@ -125,7 +126,7 @@ def navigation(
 def everything(
     out: Annotated[Path, typer.Option(help="Folder of the tables that the report reads; made if it is not there.")],
     profile: Profile = "quick",
-    jobs: Annotated[int, typer.Option(min=1, help="Banks at a time.")] = 2,
+    jobs: Annotated[int, typer.Option(min=1, max=JOBS, help="Banks at a time.")] = 2,
 ) -> None:
     """Every task, policy and bound that the report uses: yardsticks.parquet and yardsticks.runs.parquet.
 

@@ -311,7 +311,7 @@ def wild(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, float, int], None]:
         ("train/td_loss", "train/td_loss"),
         ("eval/return", "eval/return"),
         ("final/return", "final/return"),
-        ("a weight", "algorithm.q.net.agents.net.0.weight"),
+        ("a weight", "learners.0.net.agents.net.0.weight"),
     ],
 )
 def test_a_value_that_is_not_finite_fails_the_run_and_is_not_kept(
@@ -325,6 +325,17 @@ def test_a_value_that_is_not_finite_fails_the_run_and_is_not_kept(
     assert [len(r["points"]) for r in results] == [1] * at + [0]
     kept = sorted(file.name for file in (tmp_path / "a" / "run0").iterdir())
     assert kept == [f"{k:08d}.pt" for k in range(max(1, at - 1), at + 1)]  # neither a policy nor a later checkpoint
+
+
+def test_statistics_that_are_not_finite_are_not_kept(start: Start, tmp_path: Path) -> None:
+    run = start(every=2)
+    run.step()
+    trainer = run.trainer
+    assert isinstance(trainer, Trainer)
+    trainer.algorithm.standard.sums[2] = math.inf  # type: ignore[attr-defined]
+    with pytest.raises(DivergedError, match=r"^diverged: algorithm\.standard\.sums is inf at step 0; "):
+        run._save(trainer)
+    assert not (tmp_path / "a" / "run0").exists()
 
 
 def test_a_diverged_run_diverges_again_where_it_did(
