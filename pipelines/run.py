@@ -12,8 +12,6 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, NamedTuple, Self
 
-from rich.console import Console
-
 from pipelines.errors import InputError
 from pipelines.fingerprint import fingerprint
 from pipelines.host import Host, host
@@ -24,6 +22,7 @@ from pipelines.recorder import Recorder
 from pipelines.recorders import Recorders
 from pipelines.store import Home, StoreError, without_password
 from pipelines.study import Study
+from pipelines.terminal import terminal
 from pipelines.tracker import Tracker
 
 if TYPE_CHECKING:
@@ -160,7 +159,7 @@ class Launched(NamedTuple):
 
 
 def _launch(studies: Sequence[Study], home: Home, interrupts: Interrupts) -> int:
-    with board(Console()) as display, ExitStack() as logs:
+    with board(terminal()) as display, ExitStack() as logs:
         code = Code(fingerprint(), commit(), host())
         launched = [logs.enter_context(_logged(study, code, home, display)) for study in studies]
         recorders = Recorders([one.recorder for one in launched])
@@ -246,14 +245,14 @@ def animated(study: Study, plan: list[Item]) -> set[str]:
 
 
 def _summary(launched: Sequence[Launched]) -> None:
-    console = Console()
+    console = terminal()
     console.print()
     several = len(launched) > 1
     rows = [[*[one.study.name][:several], *row] for one in launched for row in _arms(one.recorder.plan, one.tracker)]
     print_table(console, [*["study"][:several], "arm", "finished", "mean return"], rows)
     for one in launched:
         for name, error in one.recorder.failures.items():
-            console.print(f"failed: {name}: {error}", markup=False, highlight=False, soft_wrap=True)
+            console.print(f"failed: {name}: {error}", soft_wrap=True)
     tracker, left = launched[0].tracker, any(one.recorder.left for one in launched)
     experiments = ", ".join(repr(one.tracker.name) for one in launched)
     lines = [
@@ -262,7 +261,7 @@ def _summary(launched: Sequence[Launched]) -> None:
         f"next:  rhmc {'study run' if left else 'export'} {_arguments([one.study for one in launched])}",
     ]
     lines[-1] += "   (continues)" if left else ""
-    console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+    console.print("\n".join(lines), soft_wrap=True)
 
 
 def _arguments(studies: Sequence[Study]) -> str:
@@ -314,7 +313,9 @@ def show_status(study: Study, home: Path, *, as_json: bool = False) -> int:
         print(json.dumps({"study": study.name, "profile": study.profile, "finished": complete, "arms": arms}))
     else:
         columns = ["planned", *STATES, "stale"]
-        print_table(Console(), ["arm", *columns], [[arm, *(str(one[c]) for c in columns)] for arm, one in arms.items()])
+        print_table(
+            terminal(), ["arm", *columns], [[arm, *(str(one[c]) for c in columns)] for arm, one in arms.items()]
+        )
     return DONE if complete else FAILED
 
 

@@ -33,7 +33,7 @@ def families() -> tuple[str, ...]:
     return ("DejaVu Sans", *(name for name in FALLBACKS if name in there))
 
 
-def settings() -> dict[str, Any]:
+def settings() -> Any:  # a mapping, as matplotlib types it
     """What a figure with words of users is drawn under."""
     return {"text.parse_math": False, "font.family": list(families())}
 

@@ -83,12 +83,12 @@ def _columns(table: pa.Table, wanted: Sequence[str]) -> Iterator[str]:
 def _faults(column: pa.ChunkedArray, name: str) -> Iterator[str]:
     """What is wrong with a column: its type, its empty cells, its range."""
     kind, what = _held(column.type), "words"
-    fits = pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_string_view(kind)
+    fits = _worded(kind)
     if name in (*WHOLE, *NUMBERS):
         what, fits = "numbers", pa.types.is_integer(kind) or pa.types.is_floating(kind)
     empty = column.null_count if name not in (*NUMBERS, *UNKNOWN) else 0
     if not fits and not (pa.types.is_null(kind) and name in (*NUMBERS, *UNKNOWN)) and len(column):
-        yield f"column {name!r} holds {kind}, not {what}"
+        yield f"column {name!r} holds {'words' if _worded(kind) else kind}, not {what}"
     elif empty:
         yield f"column {name!r} has {empty} empty cell{'s' if empty > 1 else ''} of {len(column)}"
     elif name in WHOLE and len(column):
@@ -99,6 +99,10 @@ def _faults(column: pa.ChunkedArray, name: str) -> Iterator[str]:
         else:
             if least < 0:
                 yield f"column {name!r} goes down to {least}; 0 is the least"
+
+
+def _worded(kind: pa.DataType) -> bool:
+    return pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_string_view(kind)
 
 
 def _held(kind: pa.DataType) -> pa.DataType:
