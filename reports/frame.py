@@ -255,7 +255,10 @@ def load(folder: Path, profile: str, only: str | None = None) -> Results:
     Raises:
         TableError: the folder holds no tables, or not those of the study, or they are faulty.
     """
-    files = sorted(folder.glob("*.parquet"))
+    try:
+        files = sorted(folder.glob("*.parquet"))
+    except OSError as error:
+        raise TableError(f"{folder}: cannot be read ({error.strerror})") from error
     if not files:
         raise TableError(f"{folder}: no tables here; `rhmc export` writes them")
     if only is not None:

@@ -45,6 +45,7 @@ def settle(figure: Figure) -> bool:
         lost |= _settle_ticks(axis)
     for text in figure.findobj(Text):
         assert isinstance(text, Text)
+        text.set_parse_math(False)  # also where it was made before `settings` held
         shown = readable(text.get_text(), text.get_fontproperties())
         if shown != text.get_text():
             text.set_text(shown)
