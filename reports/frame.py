@@ -347,9 +347,11 @@ def _plan_faults(results: Results) -> Iterator[str]:
         yield f"{_name(row)}: status {row.status!r} is none of {', '.join(STATUSES)}"
     for row in runs[runs["profile"] != results.profile].itertuples():
         yield f"{_name(row)}: made with profile {row.profile!r}, and this report is of {results.profile!r}"
-    for row in runs.itertuples():
-        if fault := config_fault(str(row.config)):
-            yield f"{_name(row)}: column 'config' {fault}"
+    yield from _first(
+        f"{_name(row)}: column 'config' {fault}"
+        for row in runs.itertuples()
+        if (fault := config_fault(str(row.config)))
+    )
     studies = runs[runs["study"] != YARDSTICKS]
     for row in studies[studies.duplicated(["study", "arm", "seed"])].itertuples():
         yield f"{_name(row)}: planned twice"

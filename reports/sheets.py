@@ -46,7 +46,7 @@ def read(path: Path, faults: list[str]) -> pd.DataFrame:
     """The columns of a file's form, and of `TOLD` those that are there; what is wrong goes to `faults`, a line each."""
     form = FORMS[part(path)]
     try:
-        table = pq.read_table(pa.BufferReader(content(path)))
+        table = pq.ParquetFile(pa.BufferReader(content(path))).read()
     except MemoryError:
         raise
     except (OSError, ValueError, pa.ArrowException) as error:

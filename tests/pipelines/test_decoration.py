@@ -158,7 +158,10 @@ def test_a_colour_and_a_view_that_fail(
     run.finish("finished")
     tracker.close("finished")
     assert [one.status for one in tracker.recorded()] == ["finished"]
-    assert capsys.readouterr().err == "rhmc: tiny: saved views in the log: left out (ValueError: no ink)\n"
+    assert capsys.readouterr().err.splitlines() == [
+        "rhmc: tiny: description in the log: left out (ValueError: no ink)",  # which has links to the views
+        "rhmc: tiny: saved views in the log: left out (ValueError: no ink)",
+    ]
 
 
 def test_a_plot_of_a_search_that_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -119,7 +119,7 @@ REFUSED: dict[str, tuple[Plant, str]] = {
     "a folder": (instead(Path.mkdir), "reach.parquet: not a readable Parquet table (not a file)"),
     "a pipe": (instead(os.mkfifo), "reach.parquet: not a readable Parquet table (not a file)"),
     "a link to nowhere": (instead(lambda p: p.symlink_to("nowhere")), "not a readable Parquet table (not there)"),
-    "a device": (instead(lambda p: p.symlink_to("/dev/zero")), "not a readable Parquet table (not a file)"),
+    "a device": (instead(lambda p: p.symlink_to("/dev/null")), "not a readable Parquet table (not a file)"),
     "a pipe of methods": (
         instead(os.mkfifo, "methods.json"),
         "methods.json: not the methods as `rhmc methods --out` wri",
