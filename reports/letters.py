@@ -71,7 +71,7 @@ def readable(text: str, font: FontProperties) -> str:
 
 def _invisible(sign: str) -> bool:
     """Whether nothing of it is seen: marks that join, order or vary the letters beside them."""
-    return unicodedata.category(sign) == "Cf" or "\ufe00" <= sign <= "\ufe0f"
+    return unicodedata.category(sign) == "Cf" or "\ufe00" <= sign <= "\ufe0f" or "\U000e0100" <= sign <= "\U000e01ef"
 
 
 def _axes(figure: Figure) -> Iterator[Axis]:

@@ -235,27 +235,25 @@ def whole(tmp_path: Path) -> Path:
     return write(folder, study("reach", arms, points=3), yardsticks())
 
 
-@pytest.mark.parametrize(
-    ("module", "name", "places"),
-    [
-        (figures, "learning_curves", ["curves_reach"]),
-        (figures, "each_arm", ["curves_reach_arms"]),
-        (diagrams, "architecture", ["fig_1"]),
-        (diagrams, "level", ["fig_2", "fig_3"]),
-        (gallery, "_regulation", ["fig_4"]),
-        (gallery.scenes, "navigation", ["fig_5"]),
-        (gallery.scenes, "coverage", ["fig_8"]),
-        (gallery.scenes, "counterexamples", ["counterexamples"]),
-        (gallery.comparison, "profile", ["profile_reach"]),
-        (gallery.comparison, "matrix", ["better_reach"]),
-        (gallery.beyond, "fig_assignments", ["assignments_reach"]),
-        (gallery.beyond, "fig_transfer", ["transfer"]),
-    ],
+BROKEN: tuple[tuple[Any, str, tuple[str, ...]], ...] = (
+    (diagrams, "architecture", ("fig_1",)),
+    (diagrams, "level", ("fig_2", "fig_3")),
+    (gallery, "_regulation", ("fig_4",)),
+    (gallery.scenes, "navigation", ("fig_5",)),
+    (gallery.scenes, "coverage", ("fig_8",)),
+    (gallery.scenes, "counterexamples", ("counterexamples",)),
+    (figures, "learning_curves", ("curves_reach",)),
+    (gallery.beyond, "fig_assignments", ("assignments_reach",)),
+    (gallery.comparison, "profile", ("profile_reach",)),
+    (gallery.comparison, "matrix", ("better_reach",)),
+    (gallery.beyond, "fig_transfer", ("transfer",)),
 )
-def test_a_figure_that_cannot_be_drawn_keeps_its_place(
-    module: Any, name: str, places: list[str], whole: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, name, fails)
+
+
+def test_figures_that_cannot_be_drawn_keep_their_places(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module, name, _ in BROKEN:
+        monkeypatch.setattr(module, name, fails)
+    places = [place for _, _, some in BROKEN for place in some]
     out = whole.parent / "out"
     built = build(whole, out, "quick")
     assert built.undrawn == [f"{place}: could not be drawn (ValueError: no ink)" for place in places]
@@ -264,7 +262,7 @@ def test_a_figure_that_cannot_be_drawn_keeps_its_place(
     assert page.words.count("Could not be drawn: ValueError: no ink") == len(places)
     assert (out / "index.md").read_text(encoding="utf-8").count("Could not be drawn: ValueError: no ink") == len(places)
     assert {"final_reach.csv", "table_1.csv", "runs.csv"} <= {path.name for path in (out / "tables").iterdir()}
-    assert len(list((out / "figures").glob("*.png"))) > 3
+    assert [path.name for path in (out / "figures").glob("*.png")] == ["curves_reach_arms.png"]  # the rest is there
 
 
 def test_a_figure_that_cannot_be_saved_leaves_its_numbers(
