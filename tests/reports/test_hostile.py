@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from matplotlib import font_manager
 from matplotlib.figure import Figure
@@ -192,6 +192,10 @@ TYPED = st.text(st.sampled_from(SIGNS), min_size=1, max_size=12).map(str.strip).
 
 @settings(deadline=None, max_examples=400)
 @given(TYPED)
+@example("&amp; &#35; &x1;")
+@example("[x](y) ![x](y) [x]: y")
+@example("1. x")
+@example("<!-- x --> <b>x</b>")
 def test_markdown_means_what_was_typed(text: str) -> None:
     marked = escape.markdown(text)
     for page, words in (
