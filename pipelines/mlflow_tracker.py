@@ -7,6 +7,7 @@ import json
 import logging
 import os
 import sqlite3
+import sys
 import time
 import urllib.error
 import urllib.parse
@@ -23,6 +24,7 @@ from filelock import FileLock
 
 from pipelines import legend, moved, names, views
 from pipelines.addresses import fault, scrubbed, without_password
+from pipelines.decoration import decoration
 from pipelines.errors import InputError
 from pipelines.host import Host
 from pipelines.sqlite import address, connect, connecting, reading_address, settle, sqlite_file
@@ -137,15 +139,20 @@ class MlflowTracker:
         if arm not in arms:
             return [(legend.TAG, arm)]
         place = arms.index(arm)
-        return [(legend.TAG, legend.legend(arm, place)), (legend.COLOUR, legend.colour(place))]
+        try:
+            return [(legend.TAG, legend.legend(arm, place)), (legend.COLOUR, legend.colour(place))]
+        except Exception:  # a colour never ends a launch; without one MLflow picks it
+            return [(legend.TAG, arm)]
 
     def _parent(self) -> str:
         ref = self._only("tags.role = 'study'", self.study.study, {"role": PARENT}).info.run_id
         assert self.experiment is not None
-        self._describe(ref, self.study.note)
-        experiment = self.client.get_experiment(self.experiment)
-        legends = [dict(self._look(arm, self.arms))[legend.TAG] for arm in self.study.arms]
-        save_views(self.client, experiment, views.views(self.study.params, legends))
+        with decoration(f"{self.study.study}: description in the log", _note):
+            self._describe(ref, self.study.note)
+        with decoration(f"{self.study.study}: saved views in the log", _note):
+            experiment = self.client.get_experiment(self.experiment)
+            legends = [dict(self._look(arm, self.arms))[legend.TAG] for arm in self.study.arms]
+            save_views(self.client, experiment, views.views(self.study.params, legends))
         self.client.update_run(ref, "RUNNING")
         return ref
 
@@ -429,6 +436,10 @@ class MlflowRun:
         if folder and folder.is_dir():
             for path in (*folder.rglob("*"), folder, *list(folder.parents)[:3]):
                 sync(path)
+
+
+def _note(text: str) -> None:
+    print(f"rhmc: {text}", file=sys.stderr)
 
 
 def fitting(note: str) -> str:

@@ -16,6 +16,7 @@ from pipelines.host import Host
 from pipelines.names import folded
 from pipelines.study import RunSpec, Study, changes
 from pipelines.tracker import Card, Recorded, StudyCard
+from reports.escape import code, markdown, prose
 
 LISTED = 25  # arms that a description names: MLflow keeps 8,000 characters of one
 RESULTS = (":(top,exclude)dvc.lock", ":(top,exclude,glob)reports/*/**")  # of the pipeline, as git's pathspecs
@@ -111,9 +112,9 @@ def study_card(study: Study) -> StudyCard:
     steps = sorted({run.spec.trainer.steps for run in runs})
     budget = ", ".join(f"{count:,}" for count in steps)
     note = (
-        f"{study.question}\n\n"
+        f"{prose(study.question)}\n\n"
         f"Profile `{study.profile}`: {len(arms)} arms × {len(seeds)} seeds, {budget} environment steps each.\n\n"
-        + "\n".join([*(f"- **{arm}**: {_differs(study, arm)}" for arm in arms[:LISTED]), *more(arms)])
+        + "\n".join([*(f"- **{markdown(arm)}**: {_differs(study, arm)}" for arm in arms[:LISTED]), *more(arms)])
     )
     return StudyCard(study.name, study.profile, note, _varying([run.spec for run in runs]), arms)
 
@@ -133,7 +134,7 @@ def more(arms: Sequence[str]) -> list[str]:
 def _differs(study: Study, arm: str) -> str:
     """What an arm changes in the base, as code."""
     found = changes(study.base, study.arms[arm])
-    return ", ".join(f"`{name}={value}`" for name, value in found.items()) or "the base"
+    return ", ".join(code(f"{name}={value}") for name, value in found.items()) or "the base"
 
 
 def finished(recorded: Iterable[Recorded]) -> set[tuple[str, str]]:

@@ -1,15 +1,16 @@
 """From results of training to the log and the board; knows neither Ray nor MLflow."""
 
 from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from pipelines.decoration import EPISODE, WHY_NOT, decoration
 from pipelines.overview import Overview
 from pipelines.plan import Item, finished, resolved_yaml
 from pipelines.policy import CONFIG, FILE
 from pipelines.progress import Board
-from pipelines.render import EPISODE, WHY_NOT
 from pipelines.store import Checkpoints, Home
 from pipelines.tracker import VALUES_ONLY, Recorded, RunLog, Status, StudyCard, Tracker, points_of
 from rhmc.trainer import grid_step
@@ -45,7 +46,7 @@ class Recorder:
             if (item.card.arm, item.key) not in done:
                 self.waiting[item.key].append(item)
         self.skipped = len(plan) - self.left
-        self.overview = Overview(study, plan, tracker, recorded)
+        self.overview = Overview(study, plan, tracker, recorded, board.say)
         self.overview.describe()
         self._set_aside(recorded)
         self._tidy()
@@ -94,11 +95,14 @@ class Recorder:
             log.log(points)
             log.text(CONFIG, resolved_yaml(item, self.study))
             with TemporaryDirectory() as folder:
-                for name in EXTRAS:
-                    self.tracker.file(source, name, Path(folder))
-                (Path(folder) / CONFIG).write_text(resolved_yaml(item, self.study))  # for a policy without its spec
+                with decoration(f"{item.name}: its animation", self.board.say):
+                    for name in EXTRAS:
+                        self.tracker.file(source, name, Path(folder))
+                (Path(folder) / CONFIG).write_text(
+                    resolved_yaml(item, self.study), encoding="utf-8"
+                )  # for a policy without its spec
                 if self.tracker.file(source, FILE, Path(folder)):
-                    keep(log, Path(folder))
+                    keep(log, Path(folder), item.name, self.board.say)
                 else:
                     log.tag(VALUES_ONLY, "yes")
             log.tag("reused_from", source)
@@ -149,7 +153,7 @@ class Recorder:
 
     def _finish(self, key: str) -> None:
         log, items, folder = self.logs[key], self.waiting[key], self.home.checkpoints(key)
-        keep(log, folder)
+        keep(log, folder, items[0].name, self.board.say)
         self._end(key, "finished")
         self.board.end(items[0].name, "finished")
         self._copy(log.ref, items[1:])
@@ -189,10 +193,18 @@ class Recorder:
         self.overview.ended(self.arms[key], key, status)
 
 
-def keep(log: RunLog, folder: Path) -> None:
-    """Keep what a finished training left in a folder, and offer its policy as a model."""
+def keep(log: RunLog, folder: Path, name: str = "run", say: Callable[[str], None] = lambda _: None) -> None:
+    """Keep what a finished training left in a folder, and offer its policy as a model.
+
+    Args:
+        name: what a person calls the run.
+        say: where it is said that it has no animation.
+    """
     log.artifact(folder / FILE)
-    for name in EXTRAS:
-        if (folder / name).exists():
-            log.artifact(folder / name)
+    with decoration(f"{name}: its animation", say):
+        for extra in EXTRAS:
+            if (folder / extra).exists():
+                log.artifact(folder / extra)
+        if (folder / WHY_NOT).exists():
+            say(f"{name}: no animation ({(folder / WHY_NOT).read_text(encoding='utf-8').strip()})")
     log.model(folder / FILE)

@@ -22,7 +22,6 @@ from rhmc.scripted.coverage import windows
 from rhmc.scripted.joint import best_choice
 
 FRAMES, MILLISECONDS = 40, 110
-EPISODE, WHY_NOT = "episode.gif", "episode.txt"  # what a run keeps: an animation, or why there is none
 RUN = re.compile(r"[0-9a-f]{32}")  # how MLflow names a run
 
 FREE = "free_heading_bound"  # a bound that can be shown: sensors that take any heading at once

@@ -13,8 +13,6 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, NamedTuple, Self
 
-from rich.console import Console
-
 from pipelines.addresses import without_password
 from pipelines.errors import InputError, visible
 from pipelines.fingerprint import fingerprint
@@ -28,6 +26,7 @@ from pipelines.recorder import Recorder
 from pipelines.recorders import Recorders
 from pipelines.store import Home, StoreError
 from pipelines.study import Study
+from pipelines.terminal import terminal
 from pipelines.tracker import Tracker
 
 if TYPE_CHECKING:
@@ -173,7 +172,7 @@ class Launched(NamedTuple):
 
 
 def _launch(studies: Sequence[Study], home: Home, interrupts: Interrupts) -> int:
-    with board(Console()) as display, ExitStack() as logs:
+    with board(terminal()) as display, ExitStack() as logs:
         for study in studies:
             if remark := another(home, study.name, study.profile, study.file):
                 display.say(remark)
@@ -265,14 +264,14 @@ def animated(study: Study, plan: list[Item]) -> set[str]:
 
 
 def _summary(launched: Sequence[Launched]) -> None:
-    console = Console()
+    console = terminal()
     console.print()
     several = len(launched) > 1
     rows = [[*[one.study.name][:several], *row] for one in launched for row in _arms(one.recorder.plan, one.tracker)]
     print_table(console, [*["study"][:several], "arm", "finished", "mean return"], rows)
     for one in launched:
         for name, error in one.recorder.failures.items():
-            console.print(visible(f"failed: {name}: {error}"), markup=False, highlight=False, soft_wrap=True)
+            console.print(visible(f"failed: {name}: {error}"), soft_wrap=True)
     tracker, left = launched[0].tracker, any(one.recorder.left for one in launched)
     experiments = ", ".join(repr(one.tracker.name) for one in launched)
     lines = [
@@ -281,7 +280,7 @@ def _summary(launched: Sequence[Launched]) -> None:
         f"next:  rhmc {'study run' if left else 'export'} {_arguments([one.study for one in launched])}",
     ]
     lines[-1] += "   (continues)" if left else ""
-    console.print("\n".join(map(visible, lines)), markup=False, highlight=False, soft_wrap=True)
+    console.print("\n".join(map(visible, lines)), soft_wrap=True)
 
 
 def _arguments(studies: Sequence[Study]) -> str:
@@ -334,9 +333,10 @@ def show_status(study: Study, home: Path, *, as_json: bool = False) -> int:
         print(json.dumps(told))
     else:
         columns = ["planned", *STATES, "stale"]
-        print_table(Console(), ["arm", *columns], [[arm, *(str(one[c]) for c in columns)] for arm, one in arms.items()])
+        rows = [[arm, *(str(one[c]) for c in columns)] for arm, one in arms.items()]
+        print_table(terminal(), ["arm", *columns], rows)
         lines = [f"failed: {name}: {error}" for name, error in errors.items()]
-        Console().print("\n".join(lines), markup=False, highlight=False, soft_wrap=True, end="\n" if lines else "")
+        terminal().print("\n".join(map(visible, lines)), soft_wrap=True, end="\n" if lines else "")
     return DONE if complete else FAILED
 
 

@@ -9,16 +9,16 @@ import math
 import shlex
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
-from rich.console import Console
 from ruamel.yaml import YAML
 
 from pipelines.addresses import without_password
+from pipelines.decoration import decoration
 from pipelines.errors import InputError, visible
 from pipelines.fingerprint import fingerprint
 from pipelines.found import file_name, stem, winner_yaml, write_text
@@ -29,8 +29,10 @@ from pipelines.ray_settings import set_up_ray
 from pipelines.run import BAD, DONE, FAILED, Interrupts, guarded, missing_devices
 from pipelines.search import Search
 from pipelines.store import Checkpoints, Home, StoreError
+from pipelines.terminal import terminal
 from pipelines.tracker import Card, RunLog, Status, StudyCard, Tracker
 from pipelines.trials import OBJECTIVE, Asked, BaseStorage, Ledger, explained, look, opened, storage_url
+from reports.escape import markdown, prose
 from rhmc.types import Metrics
 
 if TYPE_CHECKING:
@@ -98,7 +100,7 @@ def _launch(search: Search, home: Home, storage: BaseStorage, out: Path, interru
     tracker = MlflowTracker(search_card(search), home)
     status: Status = "interrupted"
     try:
-        with explained(url), board(Console()) as display:
+        with explained(url), board(terminal()) as display:
             if remark := another(home, search.name, search.profile, search.file):
                 display.say(remark)
             remember(home, search.name, search.profile, search.file)
@@ -113,7 +115,7 @@ def _launch(search: Search, home: Home, storage: BaseStorage, out: Path, interru
             whole = not any(ledger.left or ledger.live for ledger in ledgers)
             for ledger in ledgers if not whole else []:
                 ledger.take_up()
-            written = results(search, ledgers, code, tracker, home, out if whole else None)
+            written = results(search, ledgers, code, tracker, home, out if whole else None, display.say)
         failed = any(ledger.counts()["failed"] for ledger in ledgers)
         status = "interrupted" if not whole else "failed" if failed else "finished"
     finally:
@@ -347,11 +349,11 @@ def search_card(search: Search) -> StudyCard:
     """The search as its experiment shows it."""
     seeds = search.seed_list()
     spaces = [
-        f"- {name}: " + ", ".join(f"`{key}` {one}" for key, one in arm.space.items())
+        f"- {markdown(name)}: " + ", ".join(f"`{key}` {markdown(str(one))}" for key, one in arm.space.items())
         for name, arm in search.arms.items()
     ]
     note = (
-        f"{search.question}\n\n"
+        f"{prose(search.question)}\n\n"
         f"Search, profile `{search.profile}`: every arm has {search.trials} trials of {len(seeds)} seeds "
         f"({seeds[0]} to {seeds[-1]}) and {search.steps:,} environment steps each. Sampler {search.sampler.kind}, "
         f"pruner {search.pruner.kind}.\n\n" + "\n".join(spaces) + "\n\nA run is a trial: its curve is the mean over "
@@ -372,29 +374,40 @@ class Written(NamedTuple):
 
 
 def results(
-    search: Search, ledgers: Sequence[Ledger], code: str, tracker: Tracker, home: Home, out: Path | None
+    search: Search,
+    ledgers: Sequence[Ledger],
+    code: str,
+    tracker: Tracker,
+    home: Home,
+    out: Path | None,
+    say: Callable[[str], None] = lambda _: None,
 ) -> Written:
-    """Write the plots, and the winners once the budget is spent (`out` is given); keep all of them with the log."""
-    from pipelines.search_plots import plots
+    """Write the plots, and the winners once the budget is spent (`out` is given); keep all of them with the log.
 
+    A plot that cannot be drawn, or not be shown in the log, is left out, and that is said.
+    """
     written = Written([], [])
     for ledger in ledgers:
         title = f"{search.name} ({search.profile}): {ledger.arm}"
-        written.plots.extend(plots(ledger.study, title, plots_folder(search, home) / stem(ledger.arm)))
+        with decoration(f"{ledger.arm}: plots", say):
+            from pipelines.search_plots import plots
+
+            written.plots.extend(plots(ledger.study, title, plots_folder(search, home) / stem(ledger.arm)))
         best = ledger.best()
         if out is not None and best is not None:
             file = out / file_name(search, ledger.arm)
             write_text(file, winner_yaml(search, ledger.arm, best, ledger.counts(), code))
             written.winners.append(file)
     files = (*written.plots, *written.winners)
-    tracker.publish(search_card(search).note, {file.name: file.read_bytes() for file in files})
+    with decoration(f"{search.name}: overview in the log", say):
+        tracker.publish(search_card(search).note, {file.name: file.read_bytes() for file in files})
     return written
 
 
 def _summary(
     search: Search, ledgers: Sequence[Ledger], tracker: "MlflowTracker", written: Written, whole: bool
 ) -> None:
-    console = Console()
+    console = terminal()
     console.print()
     print_table(console, HEADER, [_row(ledger) for ledger in ledgers])
     lines = [_best_line(ledger) for ledger in ledgers]
@@ -404,7 +417,7 @@ def _summary(
     changes = [word for text in search.overrides for word in ("--set", text)]
     again = shlex.join([search.file, "--profile", search.profile, *changes])
     lines += [] if whole else [f"next:   rhmc search run {again}   (continues)"]
-    console.print("\n".join(map(visible, lines)), markup=False, highlight=False, soft_wrap=True)
+    console.print("\n".join(map(visible, lines)), soft_wrap=True)
 
 
 HEADER = ["arm", "trials", "complete", "pruned", "running", "waiting", "failed", "missing", "best"]
@@ -441,7 +454,7 @@ def show_search(search: Search, home: Path) -> int:
                 print(f"{search.name} ({search.profile}): nothing has been tried yet")
                 return FAILED
             found = [look(search, arm, code, storage) for arm in search.arms]
-            print_table(Console(), [*HEADER, "stale"], [[*_row(ledger), str(stale)] for ledger, stale in found])
+            print_table(terminal(), [*HEADER, "stale"], [[*_row(ledger), str(stale)] for ledger, stale in found])
             print("\n".join(_best_line(ledger) for ledger, _ in found))
             return DONE if all(ledger.closed >= search.trials for ledger, _ in found) else FAILED
     except StoreError as error:

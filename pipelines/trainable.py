@@ -14,6 +14,7 @@ from filelock import Timeout
 from ray.tune import Trainable
 
 from pipelines.cluster import check_code, here
+from pipelines.decoration import EPISODE, WHY_NOT
 from pipelines.health import DivergedError, check, defined
 from pipelines.policy import FILE, SPEC, Saved
 from pipelines.seeds import Seeds
@@ -139,13 +140,15 @@ class RunTrainable(Trainable):
 
     def _animate(self, kept: State) -> None:
         """Draw an episode. Training is over and a copy of the policy acts; what goes wrong here is only noted."""
-        from pipelines.render import EPISODE, WHY_NOT, episode_gif, write
-
         try:
+            from pipelines.render import episode_gif, write
+
             spec = RunSpec.model_validate_json(self.job["spec"])
             write(self.checkpoints.folder / EPISODE, episode_gif(Saved(spec, kept["algorithm"]), frames=FRAMES))
         except Exception as error:
-            (self.checkpoints.folder / WHY_NOT).write_text(f"{type(error).__name__}: {one_line(error)}\n")
+            with suppress(OSError):  # no room for the note either
+                words = f"{type(error).__name__}: {one_line(error)}\n"
+                (self.checkpoints.folder / WHY_NOT).write_text(words, encoding="utf-8")
 
     def state(self) -> State:
         """All of the run between two points: the trainer, and the metrics so far for a log that missed some."""

@@ -137,13 +137,14 @@ def say_json(value: Any) -> None:
 def table(columns: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[str] = ()) -> None:
     """A table on stdout; `numbers` are the columns that stand to the right."""
     from rich import box
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
+    from pipelines.terminal import terminal
+
     drawn = Table(box=box.SIMPLE)
     for column in columns:
-        drawn.add_column(column, justify="right" if column in numbers else "left", overflow="fold")
+        drawn.add_column(Text(column), justify="right" if column in numbers else "left", overflow="fold")
     for row in rows:
         drawn.add_row(*(Text(visible(cell)) for cell in row))
-    Console(width=None if sys.stdout.isatty() else WIDTH).print(drawn)
+    terminal(None if sys.stdout.isatty() else WIDTH).print(drawn)

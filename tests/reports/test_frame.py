@@ -99,7 +99,7 @@ def words(points: pd.DataFrame, runs: pd.DataFrame) -> Tables:
         (odd_status, "ablation, arm 'full', seed 0: status 'done' is none of finished, failed, partial, missing"),
         (no_config, "ablation, arm 'full', seed 0: column 'config' is no JSON object"),
         (no_column, "ablation.parquet: no column 'value'; there are study, arm, seed, run, step, metric"),
-        (words, "ablation.parquet: column 'value' holds str, not numbers"),
+        (words, "ablation.parquet: column 'value' holds words, not numbers"),
     ],
 )
 def test_a_planted_fault_is_one_line(tmp_path: Path, plant: Plant, line: str) -> None:
