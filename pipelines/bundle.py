@@ -12,7 +12,6 @@ import zipfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import pyarrow as pa
@@ -21,7 +20,9 @@ from filelock import FileLock, Timeout
 from pydantic import ValidationError
 
 from pipelines.export import write_parquet
+from pipelines.files import regular
 from pipelines.fingerprint import fingerprint
+from pipelines.litter import scratch
 from pipelines.plan import Item, commit, finished, items, resolved_yaml, study_card
 from pipelines.policy import CONFIG, FILE
 from pipelines.recorder import keep
@@ -111,7 +112,7 @@ def pack(study: Study, out: Path, home: Path, *, values_only: bool = False) -> P
     place, card = Home(home), study_card(study)
     tracker = open_existing(card, place)
     plan = items(study, fingerprint(), "")
-    with TemporaryDirectory() as name:
+    with scratch() as name:
         folder = Path(name)
         try:
             packed = _fill(folder, plan, tracker, place, values_only)
@@ -150,7 +151,7 @@ def _fill(folder: Path, plan: list[Item], tracker: Tracker | None, home: Home, v
 
 def _policy(tracker: Tracker, ref: str, file: Path) -> str:
     """Put a run's policy in its place and return its digest, nothing if the log has none."""
-    with TemporaryDirectory() as name:
+    with scratch() as name:
         kept = tracker.file(ref, FILE, Path(name))
         if kept is None:
             return ""
@@ -224,8 +225,9 @@ def _log(tracker: Tracker, study: StudyCard, entry: Entry, folder: Path) -> None
     log.log(points_of(entry.rows))
     log.text(CONFIG, resolved_yaml(entry.item, study))
     if entry.policy:
-        with TemporaryDirectory() as name:
-            (Path(name) / CONFIG).write_text(resolved_yaml(entry.item, study))  # for a policy without its spec
+        with scratch() as name:
+            config = resolved_yaml(entry.item, study)  # for a policy without its spec
+            (Path(name) / CONFIG).write_text(config, encoding="utf-8")
             shutil.copyfile(folder / "policies" / f"{entry.item.key}.pt", Path(name) / FILE)
             keep(log, Path(name))
     log.tag("imported", "yes")
@@ -255,7 +257,8 @@ def _opened(bundle: Path) -> Iterator[Path]:
     if bundle.is_dir():
         yield bundle
         return
-    with TemporaryDirectory() as name:
+    regular(bundle)
+    with scratch() as name:
         try:
             with zipfile.ZipFile(bundle) as archive:
                 archive.extractall(name)  # names that lead elsewhere are brought back inside

@@ -5,13 +5,13 @@ Everything heavy is imported by the verb that needs it, so that help answers at 
 Exit codes: 0 done, 1 some run failed, 2 bad input (nothing was started), 130 interrupted, 143 terminated.
 """
 
-import os
 import sys
 
 import typer
 
+from pipelines import streams
 from pipelines.commands import doctor, evaluate, render, science, search, study, ui, yardsticks
-from pipelines.commands.common import BAD, DONE, INTERRUPTED
+from pipelines.commands.common import BAD, INTERRUPTED, UNFINISHED
 from pipelines.errors import InputError
 
 EXIT_CODES = (
@@ -45,6 +45,7 @@ app.command("doctor", rich_help_panel=CODE)(doctor.doctor)
 
 def main() -> None:
     """Entry point: what a user can mend is one message on stderr and exit code 2."""
+    streams.settle()
     try:
         app(prog_name="rhmc")
     except InputError as error:
@@ -52,9 +53,10 @@ def main() -> None:
         sys.exit(BAD)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
-    except BrokenPipeError:  # the reader of our output has gone, as in `rhmc study list | head -1`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(DONE)
+    finally:
+        if why := streams.lost():
+            print(f"rhmc: standard output: {why}; what was printed is not all there", file=sys.stderr)
+            sys.exit(UNFINISHED)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import torch
@@ -11,6 +10,7 @@ import torch
 from pipelines.document import Node, Place, validate
 from pipelines.errors import InputError
 from pipelines.fingerprint import fingerprint
+from pipelines.litter import scratch
 from pipelines.plan import Item, chosen, study_card
 from pipelines.policy import CONFIG, FILE, Actor, Saved, load, settings
 from pipelines.store import Home
@@ -136,7 +136,7 @@ def of_study(study: Study, home: Path, arms: Sequence[str] = (), seeds: Sequence
 
 def _kept(tracker: Tracker, ref: str, item: Item) -> Saved | None:
     """The policy of a finished run."""
-    with TemporaryDirectory() as folder:
+    with scratch() as folder:
         file = tracker.file(ref, FILE, Path(folder))
         try:
             return load(file, item.spec) if file else None

@@ -16,7 +16,6 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from http.client import HTTPException
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from filelock import FileLock
@@ -24,6 +23,7 @@ from filelock import FileLock
 from pipelines import legend, names, views
 from pipelines.errors import InputError
 from pipelines.host import Host
+from pipelines.litter import part_of, remove, scratch
 from pipelines.store import Home, StoreError, one_line, replace_durably, sync, without_password
 from pipelines.tracker import Card, Recorded, Row, Status, StudyCard, unseen
 from rhmc.types import Metrics
@@ -306,12 +306,12 @@ class MlflowTracker:
     def publish(self, note: str, files: Mapping[str, bytes]) -> None:
         """See `Tracker`."""
         assert self.parent is not None
-        with explained(self.uri), TemporaryDirectory() as folder:
+        with explained(self.uri), scratch() as folder:
             self._describe(self.parent, note)
             for name, content in files.items():
                 (Path(folder) / name).write_bytes(content)
             if files:
-                self.client.log_artifacts(self.parent, folder)
+                self.client.log_artifacts(self.parent, str(folder))
             take_stock(self.uri)
 
     def close(self, status: Status) -> None:
@@ -365,8 +365,9 @@ class MlflowRun:
 
     def text(self, name: str, content: str) -> None:
         """See `RunLog`."""
-        with explained(self.uri):
-            self.client.log_text(self.ref, content, name)
+        with explained(self.uri), scratch() as folder:  # not `log_text`, whose own folder a kill would leave
+            (folder / name).write_text(content, encoding="utf-8")
+            self.client.log_artifact(self.ref, str(folder / name))
 
     def tag(self, name: str, value: str) -> None:
         """See `RunLog`."""
@@ -593,13 +594,12 @@ def create_database(path: Path) -> None:
     with FileLock(f"{path}.lock"):
         if path.exists() and path.stat().st_size > 0:
             return
-        part = path.with_name(f"{path.name}.part")
-        part.unlink(missing_ok=True)
+        part = part_of(path)
         try:
             MlflowClient(f"sqlite:///{part}").search_experiments()
             replace_durably(part, path)
         finally:
-            part.unlink(missing_ok=True)
+            remove(part)
 
 
 def _check_server(uri: str) -> None:

@@ -2,9 +2,9 @@
 
 from collections import defaultdict
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
+from pipelines.litter import scratch
 from pipelines.overview import Overview
 from pipelines.plan import Item, finished, resolved_yaml
 from pipelines.policy import CONFIG, FILE
@@ -92,10 +92,11 @@ class Recorder:
             log = self.tracker.start(item.card)
             log.log(points)
             log.text(CONFIG, resolved_yaml(item, self.study))
-            with TemporaryDirectory() as folder:
+            with scratch() as folder:
                 for name in EXTRAS:
                     self.tracker.file(source, name, Path(folder))
-                (Path(folder) / CONFIG).write_text(resolved_yaml(item, self.study))  # for a policy without its spec
+                config = resolved_yaml(item, self.study)  # for a policy without its spec
+                (Path(folder) / CONFIG).write_text(config, encoding="utf-8")
                 if self.tracker.file(source, FILE, Path(folder)):
                     keep(log, Path(folder))
             log.tag("reused_from", source)

@@ -4,7 +4,6 @@ import json
 import re
 import warnings
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from mlflow.models import Model, ModelSignature
 from mlflow.types import ColSpec, Schema, TensorSpec
 from mlflow.utils.mlflow_tags import MLFLOW_MODEL_VERSIONS
 
+from pipelines.litter import scratch
 from pipelines.policy import FILE, Saved, load, save, sizes
 from pipelines.study import RunSpec
 from pipelines.tracker import Card, StudyCard
@@ -104,7 +104,7 @@ def _written(
 ) -> LoggedModel:
     spec = saved.spec
     made = client.create_logged_model(experiment, name, run, tags, model_type="policy")
-    with TemporaryDirectory() as folder:
+    with scratch() as folder:
         local, file = str(Path(folder) / "model"), Path(folder) / FILE
         save(file, saved)
         save_model(

@@ -17,7 +17,7 @@ from rich.console import Console
 from pipelines.errors import InputError
 from pipelines.fingerprint import fingerprint
 from pipelines.host import Host, host
-from pipelines.plan import Item, commit, finished, items, study_card
+from pipelines.plan import Item, finished, items, read_commit, study_card
 from pipelines.progress import Board, board, print_table
 from pipelines.ray_settings import set_up_ray
 from pipelines.recorder import Recorder
@@ -161,7 +161,10 @@ class Launched(NamedTuple):
 
 def _launch(studies: Sequence[Study], home: Home, interrupts: Interrupts) -> int:
     with board(Console()) as display, ExitStack() as logs:
-        code = Code(fingerprint(), commit(), host())
+        known = read_commit()
+        if known.why:
+            display.say(f"the commit is logged as unknown: {known.why}")
+        code = Code(fingerprint(), known.name, host())
         launched = [logs.enter_context(_logged(study, code, home, display)) for study in studies]
         recorders = Recorders([one.recorder for one in launched])
         if skipped := sum(one.skipped for one in recorders.each):

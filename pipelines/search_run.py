@@ -20,7 +20,7 @@ from ruamel.yaml import YAML
 
 from pipelines.fingerprint import fingerprint
 from pipelines.found import file_name, slug, winner_yaml, write_text
-from pipelines.plan import commit
+from pipelines.plan import read_commit
 from pipelines.progress import Board, StopFile, board, print_table
 from pipelines.ray_settings import set_up_ray
 from pipelines.run import BAD, DONE, FAILED, Interrupts, guarded
@@ -257,7 +257,9 @@ class Book:
 
     def __init__(self, search: Search, code: str, tracker: Tracker, display: Board) -> None:
         self.search, self.code, self.tracker, self.board = search, code, tracker, display
-        self.commit = commit()
+        self.commit, why = read_commit()
+        if why:
+            display.say(f"the commit is logged as unknown: {why}")
         self.logs: dict[str, RunLog] = {}
 
     def start(self, asked: Asked) -> str:

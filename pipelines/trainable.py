@@ -134,7 +134,8 @@ class RunTrainable(Trainable):
             spec = RunSpec.model_validate_json(self.job["spec"])
             write(self.checkpoints.folder / EPISODE, episode_gif(Saved(spec, kept["algorithm"]), frames=FRAMES))
         except Exception as error:
-            (self.checkpoints.folder / WHY_NOT).write_text(f"{type(error).__name__}: {one_line(error)}\n")
+            why = f"{type(error).__name__}: {one_line(error)}\n"
+            (self.checkpoints.folder / WHY_NOT).write_text(why, encoding="utf-8")
 
     def state(self) -> State:
         """All of the run between two points: the trainer, and the metrics so far for a log that missed some."""

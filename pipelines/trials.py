@@ -28,6 +28,7 @@ from optuna.trial import FrozenTrial, TrialState
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import SQLAlchemyError
 
+from pipelines.litter import part_of, remove
 from pipelines.search import Dimension, Pruner, Sampler, Search, Value
 from pipelines.store import Home, StoreError, one_line
 from pipelines.study import Setting
@@ -338,13 +339,12 @@ def _create(file: Path) -> None:
     with FileLock(f"{file}.lock"):
         if file.exists() and file.stat().st_size > 0:
             return
-        part = file.with_name(f"{file.name}.part")
-        part.unlink(missing_ok=True)
+        part = part_of(file)
         try:
             RDBStorage(f"sqlite:///{part}").engine.dispose()
             part.replace(file)
         finally:
-            part.unlink(missing_ok=True)
+            remove(part)
 
 
 @contextmanager

@@ -153,16 +153,16 @@ def _write(report: Report, folder: Path) -> None:
         _save(table, sheets, name)
     if report.claims:
         _write_claims(report.claims, folder)
-    (folder / "index.md").write_text("\n".join(_index(report)) + "\n")
-    (folder / "index.html").write_text(page.render(_content(report, pictures)))
+    (folder / "index.md").write_text("\n".join(_index(report)) + "\n", encoding="utf-8")
+    (folder / "index.html").write_text(page.render(_content(report, pictures)), encoding="utf-8")
 
 
 def _write_claims(found: Sequence[Claim], folder: Path) -> None:
     listed = rules.table(found)
     listed.numbers.to_csv(folder / "claims.csv", index=False, lineterminator="\n")
     plain = json.dumps([_plain(claim) for claim in found], indent=1, ensure_ascii=False)
-    (folder / "claims.json").write_text(plain + "\n")
-    (folder / "claims.md").write_text("\n".join(_claims_page(found, listed)) + "\n")
+    (folder / "claims.json").write_text(plain + "\n", encoding="utf-8")
+    (folder / "claims.md").write_text("\n".join(_claims_page(found, listed)) + "\n", encoding="utf-8")
 
 
 def _tables(results: Results, paper: Paper) -> dict[str, Table]:
@@ -199,8 +199,8 @@ def _study_tables(results: Results, study: str) -> dict[str, Table]:
 
 def _save(table: Table, folder: Path, name: str) -> None:
     table.numbers.to_csv(folder / f"{name}.csv", index=False, float_format="%.6g", lineterminator="\n")
-    (folder / f"{name}.md").write_text(f"{table.markdown()}\n")
-    (folder / f"{name}.tex").write_text(table.latex())
+    (folder / f"{name}.md").write_text(f"{table.markdown()}\n", encoding="utf-8")
+    (folder / f"{name}.tex").write_text(table.latex(), encoding="utf-8")
 
 
 def _index(report: Report) -> Iterator[str]:

@@ -69,4 +69,4 @@ class Paper(Part):
 
 def read(path: Path = FILE) -> Paper:
     """The statements of a file. Raises pydantic's error if it does not hold what `Paper` describes."""
-    return Paper.model_validate(YAML(typ="safe", pure=True).load(path.read_text()))
+    return Paper.model_validate(YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8")))

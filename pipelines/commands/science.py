@@ -8,6 +8,7 @@ import typer
 
 from pipelines.commands.common import Profile, folder_option, table
 from pipelines.errors import InputError
+from pipelines.files import fault_of, regular
 
 
 def theorem(
@@ -53,8 +54,8 @@ def fingerprint(file: Annotated[Path | None, typer.Argument(help="Write it there
         print(text, end="")
         return
     try:
-        if not file.exists() or file.read_text() != text:
-            file.write_text(text)
+        if not file.exists() or regular(file).read_bytes() != text.encode():
+            file.write_text(text, encoding="utf-8")
     except OSError as error:
         raise InputError(f"{file}: cannot be written ({error.strerror})") from error
 
@@ -81,8 +82,8 @@ def report(
     ] = None,
 ) -> None:
     """Build figures, tables, claims and their page from the exported tables; or curves and comparison of one study."""
-    if study is not None and not study.is_file():
-        raise InputError(f"--study: {study} is not a file; a study such as studies/ablation.yaml")
+    if study is not None and (fault := fault_of(study)):
+        raise InputError(f"--study: {study}: {fault}; a study such as studies/ablation.yaml")
     if variant is not None and study is None:
         raise InputError("--variant: belongs to a study; give --study as well")
     from reports.build import main as build
