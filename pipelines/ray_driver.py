@@ -17,6 +17,7 @@ from ray.tune.experiment import Trial
 from ray.tune.search import Searcher
 
 from pipelines.cluster import DEATHS, Deaths, Place, address, knock, outline, survey, travelling, watched
+from pipelines.litter import claim, sweep_claimed
 from pipelines.progress import StopFile
 from pipelines.ray_settings import OWN_NODE, RAY_SETTINGS, set_up_ray
 from pipelines.recorders import Recorders
@@ -39,11 +40,13 @@ def sockets(name: str) -> Iterator[Path]:
         StoreError: it cannot be made.
     """
     folder = Path(tempfile.gettempdir()) / f"ray-{name}"
+    sweep_claimed(folder.parent, "ray-*")
     shutil.rmtree(folder, ignore_errors=True)
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
         if folder.stat().st_uid != os.getuid():
             raise PermissionError(0, "belongs to another user")
+        claim(folder)
     except OSError as error:
         raise StoreError(f"{folder}: Ray's folder cannot be made: {error.strerror}") from error
     try:

@@ -94,6 +94,7 @@ def _launch(search: Search, home: Home, storage: BaseStorage, out: Path, interru
             ledgers = [Ledger(search, arm, code, storage) for arm in search.arms]
             for ledger in ledgers:
                 again = ledger.take_up()
+                _clear(search, ledger, code, home)
                 display.say(f"{ledger.arm}: {ledger.closed} of {search.trials} trials are done, {again} are taken up")
             if any(ledger.left for ledger in ledgers):
                 _train(search, ledgers, Book(search, code, tracker, display), home, interrupts)
@@ -107,6 +108,12 @@ def _launch(search: Search, home: Home, storage: BaseStorage, out: Path, interru
         tracker.close(status)
     _summary(search, ledgers, tracker, written, whole)
     return {"finished": DONE, "failed": FAILED}.get(status, interrupts.code)
+
+
+def _clear(search: Search, ledger: Ledger, code: str, home: Home) -> None:
+    """Remove what a launch left that was killed between closing a trial and removing its checkpoints."""
+    for asked in ledger.over():
+        Checkpoints(home.checkpoints(trial_card(search, asked, code, "").key)).clear_unused()
 
 
 def _train(search: Search, ledgers: Sequence[Ledger], book: "Book", home: Home, interrupts: Interrupts) -> None:

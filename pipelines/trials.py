@@ -14,7 +14,7 @@ import math
 import os
 import sqlite3
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -150,6 +150,15 @@ class Ledger:
         except ValueError as error:
             self._close(place, "pruned", f"refused: {one_line(error)}", TrialState.PRUNED)
             return None
+
+    def over(self) -> list[Asked]:
+        """The trials that nothing more is done for, to be asked after `take_up`."""
+        found = []
+        for place, trial in self.latest().items():
+            if trial.state not in (TrialState.RUNNING, TrialState.WAITING):
+                with suppress(ValueError):  # refused by the method: never trained
+                    found.append(Asked(self.arm, place, trial.params, self.search.arms[self.arm].at(trial.params)))
+        return found
 
     def report(self, trial: Asked, point: Metrics, number: int) -> str:
         """Take in a point of a trial's curve.

@@ -1,11 +1,14 @@
 """Build a report: `python -m reports.build --profile quick`. The same tables give the same bytes."""
 
 import argparse
+import fcntl
 import json
 import math
+import os
 import shutil
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple, TypeVar
@@ -20,6 +23,7 @@ from reports.paper import Paper, read
 from reports.stats import FEW
 from reports.tables import Table, joined, steps
 
+PART = ".report-"  # begins the name of a report that is not finished
 MADE = ("figures", "tables", "claims.md", "claims.csv", "claims.json", "index.md", "index.html")
 
 DEFINITIONS = (
@@ -89,11 +93,11 @@ def build(runs: Path, out: Path, profile: str, study: str | None = None) -> list
     results, paper = load(runs, profile, study), read()
     made = _whole(results, paper) if study is None else _single(results, paper, study)
     out.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(prefix=".report-", dir=out) as folder:
-        _write(made, Path(folder))
-        names = [name for name in MADE if (Path(folder) / name).exists()]
+    with _alone_in(out) as folder:
+        _write(made, folder)
+        names = [name for name in MADE if (folder / name).exists()]
         for name in names:
-            _replace(Path(folder) / name, out / name)
+            _replace(folder / name, out / name, folder / f"old-{name}")
     return sorted(path for name in names for path in [out / name, *(out / name).rglob("*")] if path.is_file())
 
 
@@ -402,10 +406,25 @@ def _plain(claim: Claim) -> dict[str, object]:
     return claim._asdict() | {"ours": ours, "provisional": claim.provisional}
 
 
-def _replace(new: Path, old: Path) -> None:
-    """Put a finished file or folder in the place of the old one."""
+@contextmanager
+def _alone_in(out: Path) -> Iterator[Path]:
+    """A folder in `out` to make a report in. Two that go to one place take turns, so what is there is a dead one's."""
+    held = os.open(out, os.O_RDONLY)
+    try:
+        with suppress(OSError):  # a file system without locks
+            fcntl.flock(held, fcntl.LOCK_EX)
+            for left in out.glob(f"{PART}*"):
+                shutil.rmtree(left, ignore_errors=True)
+        with TemporaryDirectory(prefix=PART, dir=out) as folder:
+            yield Path(folder)
+    finally:
+        os.close(held)
+
+
+def _replace(new: Path, old: Path, aside: Path) -> None:
+    """Put a finished file or folder in the place of the old one, which goes with the folder that it is moved to."""
     if old.is_dir():
-        shutil.rmtree(old)
+        old.replace(aside)
     new.replace(old)
 
 

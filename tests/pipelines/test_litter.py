@@ -54,11 +54,12 @@ def test_a_writer_is_dead_if_its_machine_is_this_one_and_its_process_gone(living
 
 
 def test_who_writes_a_file_again_removes_the_parts_of_the_dead(tmp_path: Path, living: int, gone: int) -> None:
-    left = [f"a.txt.{HOST}-{gone}.part", f"a.txt.{HOST}-{gone}.part-journal"]
+    left = [f"a.txt.{HOST}-{gone}.part-journal"]
     stays = [f"a.txt.{HOST}-{living}.part", f"b.txt.{HOST}-{gone}.part", "a.txt.part", "a.txt.backup", "a.txt.17.part"]
+    stays += [f"a.txt.{HOST}-{gone}.part2"]
     for name in left + stays:
         (tmp_path / name).write_bytes(b"half")
-    folder = tmp_path / f"a.txt.{HOST}-{gone}.part2"  # a part may be a folder
+    folder = tmp_path / f"a.txt.{HOST}-{gone}.part"  # a part may be a folder
     folder.mkdir()
     (folder / "inside").write_bytes(b"half")
     with whole(tmp_path / "a.txt") as part:
