@@ -17,6 +17,7 @@ import tempfile
 import threading
 import time
 import urllib.request
+from collections.abc import Callable
 from contextlib import nullcontext, suppress
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
@@ -36,6 +37,7 @@ from pipelines.plan import study_card
 from pipelines.recorders import Recorders
 from pipelines.store import Home
 from pipelines.study import Study
+from pipelines.tracker import StudyCard
 from pipelines.trainable import RunTrainable
 from tests.pipelines.support import CODE
 
@@ -65,7 +67,12 @@ class Run(NamedTuple):
 
 def everything(study: Study, home: Path) -> list[Run]:
     """All that a study has logged and its parent, in an order that does not depend on when it was logged."""
-    tracker = open_existing(study_card(study), Home(home))
+    return logged(study_card(study), home)
+
+
+def logged(card: StudyCard, home: Path) -> list[Run]:
+    """See `everything`; of a study or a search."""
+    tracker = open_existing(card, Home(home))
     assert tracker is not None
     found = tracker.client.search_runs([tracker.experiment], "", ViewType.ACTIVE_ONLY, 1000)
     return sorted(_run(tracker.client, one, home) for one in found)
@@ -131,9 +138,12 @@ class Fuse:
 
     def __init__(self, length: int) -> None:
         self.length, self.count = length, 0
+        self.counts: Callable[[], bool] = lambda: True  # whether a write counts now
 
     def tick(self) -> None:
         """A write is about to happen."""
+        if not self.counts():
+            return
         self.count += 1
         if self.count == self.length:
             os.kill(os.getpid(), signal.SIGKILL)
@@ -188,7 +198,7 @@ def start(target: Any, *args: Any) -> ForkServerProcess:
 
 
 def _drive(study: str, home: str, uri: str | None, length: int, room: int | None) -> None:
-    _settle(Path(home) / "driver.log")
+    settle(Path(home) / "driver.log")
     if room:
         resource.setrlimit(resource.RLIMIT_FSIZE, (room, room))
     if uri:
@@ -204,7 +214,7 @@ def _drive(study: str, home: str, uri: str | None, length: int, room: int | None
     sys.exit(status)
 
 
-def _settle(log: Path) -> None:
+def settle(log: Path) -> None:
     """Write to the log, and end when the tests do, however they do."""
     handle = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     os.dup2(handle, 1)
@@ -275,7 +285,7 @@ class _Quiet(WSGIRequestHandler):
 
 
 def _serve(home: str, port: int, length: int) -> None:
-    _settle(Path(home) / "server.log")
+    settle(Path(home) / "server.log")
     logging.getLogger("alembic").setLevel(logging.ERROR)
     os.environ["_MLFLOW_SERVER_FILE_STORE"] = f"sqlite:///{home}/mlflow.db"
     os.environ["_MLFLOW_SERVER_ARTIFACT_ROOT"] = "mlflow-artifacts:/"
