@@ -5,6 +5,7 @@ A part lies beside what it will be (`runs.parquet.<host>-<pid>.part`), a scratch
 scratch the scratch. A writer on another machine cannot be asked and counts as living.
 """
 
+import errno
 import hashlib
 import os
 import shutil
@@ -45,7 +46,13 @@ def dead(writer: str) -> bool:
 
 
 def part_of(path: Path) -> Path:
-    """Where this process writes what is to become `path`; what dead ones left of it is removed."""
+    """Where this process writes what is to become `path`; what dead ones left of it is removed.
+
+    Raises:
+        FileExistsError: a device, a pipe or a socket is there, which a rename would put an end to for all who use it.
+    """
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise FileExistsError(errno.EEXIST, "a device, a named pipe or a socket is there", str(path))
     with suppress(OSError):  # no such folder, or a closed one
         for name in os.listdir(path.parent):
             writer, found, end = name.removeprefix(f"{path.name}.").partition(PART)

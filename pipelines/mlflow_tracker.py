@@ -22,6 +22,7 @@ from filelock import FileLock
 
 from pipelines import legend, names, views
 from pipelines.errors import InputError
+from pipelines.files import ABSENT, fault_of
 from pipelines.host import Host
 from pipelines.litter import part_of, remove, scratch
 from pipelines.store import Home, StoreError, one_line, replace_durably, sync, without_password
@@ -556,6 +557,8 @@ def check(uri: str) -> None:
 
 def _check_file(path: Path) -> None:
     advice = "move it away, or name another store in MLFLOW_TRACKING_URI"
+    if (fault := fault_of(path)) and fault != ABSENT:
+        raise StoreError(f"{path}: not an MLflow database: {fault}; {advice}")
     try:
         if not path.exists() or path.stat().st_size == 0:
             if not path.parent.is_dir():

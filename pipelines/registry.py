@@ -2,7 +2,10 @@
 
 import json
 import re
+import urllib.parse
+import urllib.request
 import warnings
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +19,7 @@ from mlflow.models import Model, ModelSignature
 from mlflow.types import ColSpec, Schema, TensorSpec
 from mlflow.utils.mlflow_tags import MLFLOW_MODEL_VERSIONS
 
-from pipelines.litter import scratch
+from pipelines.litter import remove, scratch
 from pipelines.policy import FILE, Saved, load, save, sizes
 from pipelines.study import RunSpec
 from pipelines.tracker import Card, StudyCard
@@ -89,6 +92,8 @@ def _logged(
         if made is None and there.status == LoggedModelStatus.READY:
             made = there
         else:
+            if there.status != LoggedModelStatus.READY:
+                _remove_files(there.artifact_location)
             client.delete_logged_model(there.model_id)
     saved = load(policy)
     if made is None:
@@ -97,6 +102,16 @@ def _logged(
     if not outputs or not outputs.model_outputs:
         client.log_outputs(run, [LoggedModelOutput(made.model_id, step=saved.spec.trainer.steps)])
     return made
+
+
+def _remove_files(location: str) -> None:
+    """Remove what a killed launch copied of a model, where files are kept in a folder: MLflow leaves them for good."""
+    address = urllib.parse.urlsplit(location)
+    if address.scheme in ("", "file"):
+        folder = Path(urllib.request.url2pathname(address.path))
+        remove(folder)
+        with suppress(OSError):
+            folder.parent.rmdir()
 
 
 def _written(

@@ -172,7 +172,10 @@ def whole(path: Path, *, durable: bool = False) -> Iterator[Path]:
     Raises:
         StoreError: the disk is full or the folder closed; nothing half-written is left.
     """
-    part = part_of(path)
+    try:
+        part = part_of(path)
+    except OSError as error:
+        raise StoreError(f"{path}: cannot be written: {reason(error)}") from error
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield part

@@ -337,7 +337,8 @@ def _open(url: str, write: bool) -> BaseStorage | None:
     file = Path(url.removeprefix("sqlite:///"))
     if not write and not file.exists():
         return None
-    _create(file)
+    if write:
+        _create(file)
     return RDBStorage(url, engine_kwargs={"connect_args": {"timeout": 60}})
 
 

@@ -175,6 +175,8 @@ def _read(path: Path, form: TypeAdapter[T], faults: list[str]) -> T | None:
     if not path.exists():
         return None
     try:
+        if not path.is_file():  # reading a named pipe would wait for ever
+            raise ValueError("no regular file")
         return form.validate_python(json.loads(path.read_text(encoding="utf-8")))
     except ValidationError as error:
         first = error.errors()[0]

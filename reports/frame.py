@@ -291,7 +291,9 @@ def load(folder: Path, profile: str, only: str | None = None) -> Results:
         joined = {part: _join(found, FORMS[part]) for part, found in tables.items()}
         watched, moved, notes = _of_plan(joined)
         points = _join([joined["points"], watched], POINTS)
-        gifs = {path.stem.partition("_")[2]: path.read_bytes() for path in sorted(folder.glob(EPISODES))}
+        gifs = {
+            path.stem.partition("_")[2]: path.read_bytes() for path in sorted(folder.glob(EPISODES)) if path.is_file()
+        }
         results = Results(points, joined["runs"], profile, moved=moved, notes=notes)
         if only is None:
             methods, modules, scenes = drawn
@@ -353,6 +355,9 @@ def _only(files: Sequence[Path], study: str, folder: Path) -> list[Path]:
 
 
 def _read(path: Path, columns: Sequence[str], faults: list[str]) -> pd.DataFrame:
+    if not path.is_file():  # reading a named pipe would wait for ever
+        faults.append(f"{path.name}: not a regular file")
+        return pd.DataFrame(columns=list(columns))
     try:
         table = pd.read_parquet(path)
     except (OSError, ValueError):  # pyarrow's errors are among them
@@ -373,6 +378,8 @@ def _methods(path: Path, faults: list[str]) -> list[dict[str, Any]]:
     if not path.exists():
         return []
     try:
+        if not path.is_file():
+            raise ValueError("no regular file")
         found = json.loads(path.read_text(encoding="utf-8"))
         return [
             {name: str(row[name]) for name in METHOD}

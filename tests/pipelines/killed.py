@@ -34,8 +34,8 @@ from tests.pipelines import chaos
 from tests.pipelines.chaos import KILLED, Fuse, Run, faults, fit_here, logged, settle, start
 from tests.pipelines.support import CODE, setting, tiny
 
-chaos.PRELOAD.append("tests.pipelines.killed")
-STUDY = tiny("killed", 6, {name: setting(lr=rate) for name, rate in {"slow": 1e-4, "fast": 1e-2, "twin": 1e-2}.items()})
+chaos.PRELOAD.extend(["pipelines.bundle", "pipelines.registry", "pipelines.search_plots", "reports.build"])
+STUDY = tiny("killed", 6, {name: setting(lr=1e-2) for name in ("fast", "twin")})  # one is trained and the other copied
 SEARCH = """\
 question: Which?
 base:
@@ -44,7 +44,6 @@ base:
   trainer: {num_envs: 8, evaluations: 3, eval_episodes: 4, final_episodes: 8}
 arms:
   IQL: {space: {lr: {low: 1e-4, high: 1e-2, log: true}, gamma: {low: 0.5, high: 0.9}}}
-  VDN: {algo: {kind: vdn}, space: {lr: {low: 1e-4, high: 1e-2, log: true}}}
 trials: {quick: 3, paper: 3}
 seeds: 1
 steps: 400

@@ -10,9 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from pipelines import litter
+from pipelines import litter, trials
 from pipelines.litter import HOST, claim, dead, part_of, scratch, sweep_claimed, sweep_scratch
-from pipelines.store import Home, whole
+from pipelines.mlflow_tracker import create_database
+from pipelines.store import Home, StoreError, whole
 
 WAITS = "import sys; print('ready', flush=True); sys.stdin.read()"
 
@@ -115,6 +116,17 @@ def test_claimed_folders(tmp_path: Path, living: int, gone: int, monkeypatch: py
     (tmp_path / "ray-other").mkdir()
     sweep_claimed(tmp_path, "ray-*")
     assert {path.name for path in tmp_path.iterdir()} == {f"ray-{living}", "ray-other"}
+
+
+def test_what_is_no_file_is_not_replaced(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(StoreError, match=r"pipe: cannot be written: a device, a named pipe or a socket is there"):
+        with whole(tmp_path / "pipe") as part:
+            part.write_bytes(b"x")
+    for create in (create_database, trials._create):
+        with pytest.raises(OSError, match="a named pipe"):
+            create(tmp_path / "pipe")
+    assert (tmp_path / "pipe").is_fifo()
 
 
 def test_no_part_where_there_is_no_folder(tmp_path: Path) -> None:
