@@ -120,9 +120,9 @@ def test_claimed_folders(tmp_path: Path, living: int, gone: int, monkeypatch: py
 
 def test_what_is_no_file_is_not_replaced(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(StoreError, match=r"pipe: cannot be written: a device, a named pipe or a socket is there"):
-        with whole(tmp_path / "pipe") as part:
-            part.write_bytes(b"x")
+    refused = pytest.raises(StoreError, match="pipe: cannot be written: a device, a named pipe or a socket is there")
+    with refused, whole(tmp_path / "pipe"):
+        pass
     for create in (create_database, trials._create):
         with pytest.raises(OSError, match="a named pipe"):
             create(tmp_path / "pipe")
