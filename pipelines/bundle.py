@@ -6,14 +6,11 @@ values only has no policies and no runs under way. What a bundle may hold is che
 sizes), `bundle_rows` (the study, its runs and their values) and `bundle_states` (policies and checkpoints).
 """
 
-import glob
 import hashlib
 import json
 import math
 import os
-import re
 import shutil
-import socket
 import tempfile
 import zipfile
 from collections.abc import Iterator, Sequence
@@ -29,6 +26,7 @@ from pipelines.bundle_rows import FORMAT, POINTS, RUNS, Entry, Manifest, Told, r
 from pipelines.bundle_states import check_states, states_of
 from pipelines.export import write_parquet
 from pipelines.fingerprint import fingerprint
+from pipelines.litter import part_of
 from pipelines.plan import Item, commit, finished, items, resolved_yaml, study_card
 from pipelines.policy import CONFIG, FILE
 from pipelines.recorder import keep
@@ -83,7 +81,6 @@ def pack(study: Study, out: Path, home: Path, *, values_only: bool = False) -> P
     place, card = Home(home), study_card(study)
     tracker = open_existing(card, place)
     plan = items(study, fingerprint(), "")
-    _sweep(out.parent, out.name)
     with whole(out) as part, _beside(part, out) as folder:
         packed = _fill(folder, plan, tracker, place, values_only)
         if packed.finished + packed.begun == 0:
@@ -104,7 +101,7 @@ def _beside(part: Path, out: Path) -> Iterator[Path]:
         part.mkdir()
         yield part
         return
-    folder = part.with_name(f"{out.name}.files{part.name.removeprefix(out.name)}")
+    folder = part_of(out.with_name(f"{out.name}.files"))
     folder.mkdir()
     try:
         yield folder
@@ -309,8 +306,7 @@ def _desk(home: Home) -> Iterator[Path]:
     """
     fresh = not home.root.exists()
     home.prepare()
-    _sweep(home.root, DESK)
-    desk, before = home.root / f"{DESK}.{_process()}.part", tempfile.tempdir
+    desk, before = part_of(home.root / DESK), tempfile.tempdir
     try:
         desk.mkdir()
         tempfile.tempdir = str(desk)
@@ -323,26 +319,3 @@ def _desk(home: Home) -> Iterator[Path]:
         if fresh:
             with suppress(OSError):  # something was taken in
                 home.root.rmdir()
-
-
-def _process() -> str:
-    """This process in the name of what it has not finished, as `store.whole` writes it."""
-    return f"{socket.gethostname()}-{os.getpid()}"
-
-
-def _sweep(folder: Path, name: str) -> None:
-    """Remove what processes of this machine that are gone have left on the way to a name."""
-    ours = re.compile(rf"{re.escape(name)}(\.files)?\.{re.escape(socket.gethostname())}-([0-9]+)\.part")
-    for part in folder.glob(f"{glob.escape(name)}.*.part"):
-        if (found := ours.fullmatch(part.name)) and not _alive(int(found[2])):
-            shutil.rmtree(part, ignore_errors=True) if part.is_dir() else part.unlink(missing_ok=True)
-
-
-def _alive(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except (PermissionError, OverflowError):
-        return True
-    return True

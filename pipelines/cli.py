@@ -16,9 +16,10 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
+from pipelines import streams
 from pipelines.addresses import reach_loopback, scrubbed
 from pipelines.commands import doctor, evaluate, render, science, search, study, ui, yardsticks
-from pipelines.commands.common import BAD, DONE, INTERRUPTED, UNFINISHED
+from pipelines.commands.common import BAD, INTERRUPTED, UNFINISHED
 from pipelines.errors import InputError, visible
 
 EXIT_CODES = (
@@ -80,6 +81,7 @@ app.command("doctor", rich_help_panel=CODE)(doctor.doctor)
 
 def main() -> None:
     """Entry point: what a user can mend is one message on stderr and exit code 2."""
+    streams.settle()
     reach_loopback()
     try:
         app(prog_name="rhmc")
@@ -88,15 +90,16 @@ def main() -> None:
         sys.exit(BAD)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
-    except BrokenPipeError:  # the reader of our output has gone, as in `rhmc study list | head -1`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(DONE)
     except Exception as error:
         if isinstance(error, OSError) and (found := _of_the_system(error)):
             print(scrubbed(str(found)), file=sys.stderr)
             sys.exit(BAD)
         print(scrubbed(traceback.format_exc()), file=sys.stderr, end="")  # a fault of ours: the whole of it
         sys.exit(UNFINISHED)
+    finally:
+        if why := streams.lost():
+            print(f"rhmc: standard output: {why}; what was printed is not all there", file=sys.stderr)
+            sys.exit(UNFINISHED)
 
 
 def _of_the_system(error: OSError) -> InputError | None:

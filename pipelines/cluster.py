@@ -23,6 +23,7 @@ from ray.exceptions import GetTimeoutError, RayError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from pipelines.fingerprint import fingerprint, package_folder
+from pipelines.litter import dead, owner, remove
 from pipelines.store import StoreError, one_line
 
 KNOCK = 5.0  # seconds to wait for a cluster to answer
@@ -289,7 +290,10 @@ def survey(home: Path) -> list[str]:
 @contextmanager
 def probing(home: Path) -> Iterator[Path]:
     """A locked file in the work folder; it goes, with what nodes left beside it."""
-    probe = home / f".nodes-{uuid.uuid4().hex}"
+    for left in home.glob(".nodes-*"):
+        if dead("-".join(left.name.split("-")[1:3])):
+            remove(left)
+    probe = home / f".nodes-{owner()}-{uuid.uuid4().hex}"
     try:
         with FileLock(probe):
             yield probe

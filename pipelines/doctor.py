@@ -37,7 +37,7 @@ def examine(home: Path, *, ray: bool = True) -> Iterator[Finding]:
         home: the work folder; it need not be there.
         ray: also start Ray, which takes seconds.
     """
-    checks: list[Callable[[], Iterable[Finding]]] = [python, libraries, torch_build]
+    checks: list[Callable[[], Iterable[Finding]]] = [python, libraries, torch_build, code]
     checks += [lambda: disk(home), lambda: store(Home(home)), *([lambda: starts_ray(home)] if ray else [])]
     for check in checks:
         yield from check()
@@ -90,6 +90,16 @@ def torch_build() -> list[Finding]:
         text = f"{torch.__version__}, built for CUDA {cuda}, and no device is here; the CPU build gives pinned results"
         return [Finding("note", "torch", text)]
     return [Finding("ok", "torch", f"{torch.__version__}, {f'CUDA {cuda}' if cuda else 'CPU build'}")]
+
+
+def code(where: Path | None = None) -> list[Finding]:
+    """Whether the commit that runs are logged with can be read. where: a folder of the code; this one if None."""
+    from pipelines.plan import read_commit
+
+    found = read_commit(where) if where else read_commit()
+    if found.why:
+        return [Finding("note", "code", f"runs are logged with an unknown commit: {found.why}")]
+    return [Finding("ok", "code", f"commit {found.name}")]
 
 
 def disk(home: Path, needed: int = NEEDED) -> list[Finding]:

@@ -9,6 +9,7 @@ import enum
 import json
 import math
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -22,6 +23,7 @@ from ruamel.yaml.nodes import Node as YamlNode
 
 from pipelines import limits
 from pipelines.errors import seen
+from pipelines.files import ABSENT, fault_of
 
 LIMIT = 1_000_000  # bytes; larger is no study
 EXACT = 2**53  # floats below it that are whole numbers are read as integers: 5e6 is a number of steps
@@ -84,11 +86,13 @@ class Node(NamedTuple):
 def read(path: Path) -> tuple[Node | None, list[Fault]]:
     """The document in a file, and what is wrong with it as YAML. No document means that nothing could be read."""
     source = str(path)
+    if fault := fault_of(path):
+        return None, [Fault(Place(source), "", _unreadable(path, fault))]
     try:
         with path.open("rb") as file:
             data = file.read(LIMIT + 1)
     except OSError as error:
-        return None, [Fault(Place(source), "", _unreadable(path, error))]
+        return None, [Fault(Place(source), "", error.strerror or str(error))]
     if len(data) > LIMIT:
         return None, [Fault(Place(source), "", f"larger than {LIMIT} bytes; a study is a short text")]
     try:
@@ -105,14 +109,16 @@ def override(text: str, path: str, value: str) -> tuple[Node | None, list[Fault]
     return _Reader(text, marks=False).read(value, path)
 
 
-def _unreadable(path: Path, error: OSError) -> str:
-    if path.is_dir():
-        found = sorted(p.name for p in path.glob("*.yaml"))
-        return "a directory; give one study" + (f" of it: {', '.join(found)}" if found else "")
-    if isinstance(error, FileNotFoundError):
-        near = [str(p) for folder in (path.parent, Path("studies")) for p in sorted(folder.glob("*.yaml"))]
-        return "no such file" + nearest(str(path), near)
-    return error.strerror or str(error)
+def _unreadable(path: Path, fault: str) -> str:
+    """What is wrong with a path, and what may have been meant."""
+    with suppress(OSError):
+        if path.is_dir():
+            found = sorted(p.name for p in path.glob("*.yaml"))
+            return "a directory; give one study" + (f" of it: {', '.join(found)}" if found else "")
+        if fault == ABSENT:
+            near = [str(p) for folder in (path.parent, Path("studies")) for p in sorted(folder.glob("*.yaml"))]
+            return fault + nearest(str(path), near)
+    return fault
 
 
 class _Reader:

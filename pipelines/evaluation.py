@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import torch
@@ -11,6 +10,7 @@ import torch
 from pipelines.document import Node, Place, validate
 from pipelines.errors import InputError
 from pipelines.fingerprint import fingerprint
+from pipelines.litter import scratch
 from pipelines.plan import Item, chosen, study_card
 from pipelines.policy import CONFIG, FILE, Actor, NoPolicyError, Saved, load, settings
 from pipelines.store import Home
@@ -136,8 +136,8 @@ def of_study(study: Study, home: Path, arms: Sequence[str] = (), seeds: Sequence
 
 def _kept(tracker: Tracker, run: Recorded, item: Item) -> Saved | None:
     """The policy of a finished run; None if it came without one."""
-    with TemporaryDirectory() as folder:
-        file = tracker.file(run.ref, FILE, Path(folder))
+    with scratch() as folder:
+        file = tracker.file(run.ref, FILE, folder)
         if file is None:
             if run.values_only:
                 return None

@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipelines.errors import InputError, visible
+from pipelines.files import regular
 from pipelines.fingerprint import fingerprint
 from pipelines.host import Host
 from pipelines.origin import another
@@ -134,6 +135,7 @@ def read_parquet(path: Path, schema: pa.Schema, what: str) -> list[dict[str, Any
     """
     if not path.exists():
         return []
+    regular(path)
     try:
         table = pq.read_table(path)
     except (OSError, pa.ArrowException) as error:

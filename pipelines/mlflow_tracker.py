@@ -17,7 +17,6 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from http.client import HTTPException
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from filelock import FileLock
@@ -26,7 +25,9 @@ from pipelines import legend, moved, names, views
 from pipelines.addresses import fault, scrubbed, without_password
 from pipelines.decoration import decoration
 from pipelines.errors import InputError
+from pipelines.files import ABSENT, fault_of
 from pipelines.host import Host
+from pipelines.litter import part_of, remove, scratch
 from pipelines.sqlite import address, connect, connecting, reading_address, settle, sqlite_file
 from pipelines.store import Home, StoreError, one_line, replace_durably, sync
 from pipelines.tracker import VALUES_ONLY, Card, Recorded, Row, Status, StudyCard, unseen
@@ -328,12 +329,12 @@ class MlflowTracker:
     def publish(self, note: str, files: Mapping[str, bytes]) -> None:
         """See `Tracker`."""
         assert self.parent is not None
-        with explained(self.uri), TemporaryDirectory() as folder:
+        with explained(self.uri), scratch() as folder:
             self._describe(self.parent, note)
             for name, content in files.items():
                 (Path(folder) / name).write_bytes(content)
             if files:
-                self.keeps(self.parent).log_artifacts(folder)
+                self.keeps(self.parent).log_artifacts(str(folder))
             take_stock(self.uri)
 
     def close(self, status: Status) -> None:
@@ -397,8 +398,8 @@ class MlflowRun:
 
     def text(self, name: str, content: str) -> None:
         """See `RunLog`."""
-        with explained(self.uri), TemporaryDirectory() as folder:
-            file = Path(folder) / name
+        with explained(self.uri), scratch() as folder:  # not `log_text`, whose own folder a kill would leave
+            file = folder / name
             file.write_text(scrubbed(content) if name == TRACE else content, encoding="utf-8")
             self.tracker.keeps(self.ref).log_artifact(str(file))
 
@@ -642,6 +643,8 @@ def check(uri: str, *, write: bool = True) -> None:
 
 def _check_file(path: Path, write: bool) -> None:
     advice = "move it away, or name another store in MLFLOW_TRACKING_URI"
+    if (fault := fault_of(path)) and fault != ABSENT:
+        raise StoreError(f"{path}: not an MLflow database: {fault}; {advice}")
     try:
         if not path.exists() or path.stat().st_size == 0:
             if not path.parent.is_dir():
@@ -676,13 +679,12 @@ def create_database(path: Path) -> None:
     with FileLock(f"{path}.lock"):
         if path.exists() and path.stat().st_size > 0:
             return
-        part = path.with_name(f"{path.name}.part")
-        part.unlink(missing_ok=True)
+        part = part_of(path)
         try:
             MlflowClient(address(part)).search_experiments()
             replace_durably(part, path)
         finally:
-            part.unlink(missing_ok=True)
+            remove(part)
 
 
 def _check_server(uri: str) -> None:

@@ -18,6 +18,7 @@ from pathlib import Path
 from ray._private import ray_constants
 from ray._raylet import AuthenticationTokenLoader, Config  # type: ignore[attr-defined]
 
+from pipelines.litter import claim, sweep_claimed
 from pipelines.store import StoreError
 
 AUTH = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
@@ -57,8 +58,8 @@ def closed() -> Iterator[None]:
 def private_folder(name: str) -> Iterator[Path]:
     """A folder for Ray's sockets and logs that its owner alone can enter; Ray opens its own, inside, to everybody.
 
-    The names of sockets have to be short, so it cannot lie in the work folder. A killed driver leaves it behind, so it
-    has the same name each time and is made anew.
+    The names of sockets have to be short, so it cannot lie in the work folder. A killed driver leaves it behind; the
+    next one removes it.
 
     Args:
         name: tells it from those of other drivers that may run now.
@@ -69,9 +70,11 @@ def private_folder(name: str) -> Iterator[Path]:
     above = Path(tempfile.gettempdir())
     folder = above / f"ray-{name}"
     _check_place(above, len(os.fsencode(folder / INSIDE)) - LONGEST)
+    sweep_claimed(above, "ray-*")
     shutil.rmtree(folder, ignore_errors=True)  # does not follow links
     try:
         folder.mkdir(mode=0o700)  # fails on whatever is there still: a link, or what is not ours to remove
+        claim(folder)
     except FileExistsError as error:
         owner = folder.lstat().st_uid
         raise StoreError(

@@ -1,6 +1,7 @@
 """What a study asks for, set against what is there."""
 
 import json
+import os
 import subprocess
 from collections.abc import Iterable, Sequence
 from io import StringIO
@@ -20,6 +21,7 @@ from reports.escape import code, markdown, prose
 
 LISTED = 25  # arms that a description names: MLflow keeps 8,000 characters of one
 RESULTS = (":(top,exclude)dvc.lock", ":(top,exclude,glob)reports/*/**")  # of the pipeline, as git's pathspecs
+PATIENCE = 10.0  # seconds for git to answer
 KIND = "algo.kind"  # which is what the param `method` says
 
 
@@ -161,8 +163,20 @@ def _lists_on_a_line(tree: Any) -> Any:
     return line
 
 
+class Commit(NamedTuple):
+    """The code's commit, with `-dirty` where files differ from it; `unknown` where it cannot be read, and why."""
+
+    name: str
+    why: str = ""
+
+
 def commit(where: Path = Path(__file__).parent) -> str:
-    """The commit of the code, with `-dirty` where files differ from it; `unknown` outside a repository.
+    """The name that `read_commit` finds."""
+    return read_commit(where).name
+
+
+def read_commit(where: Path = Path(__file__).parent) -> Commit:
+    """The commit of the code.
 
     Results are not looked at: `dvc repro` writes its lock and the report's tables after every stage.
 
@@ -172,11 +186,30 @@ def commit(where: Path = Path(__file__).parent) -> str:
     try:
         name = _git(where, "rev-parse", "HEAD")
         changed = _git(where, "status", "--porcelain", "--untracked-files=no", "--", ":/", *RESULTS)
-    except (OSError, subprocess.SubprocessError):
-        return "unknown"
-    return f"{name}-dirty" if changed else name
+    except FileNotFoundError:
+        return Commit("unknown", "git is not installed")
+    except subprocess.TimeoutExpired as error:
+        return Commit("unknown", f"git did not answer within {error.timeout:.0f} s in {where}")
+    except subprocess.CalledProcessError as error:
+        return Commit("unknown", _said(error.stderr, where))
+    except OSError as error:
+        return Commit("unknown", f"git cannot be run: {error.strerror}")
+    return Commit(f"{name}-dirty" if changed else name)
+
+
+def _said(words: str, where: Path) -> str:
+    """What git wrote, and what helps, on one line."""
+    lines = [line.strip() for line in words.splitlines() if line.strip()]
+    remedy = [line for line in lines if line.startswith("git config ")]
+    text = f"git in {where}: {lines[0].removeprefix('fatal: ')}" if lines else f"git failed in {where}"
+    return text + (f"; {remedy[0]} lets you read it" if remedy else "")
 
 
 def _git(where: Path, *words: str) -> str:
-    done = subprocess.run(["git", *words], cwd=where, capture_output=True, text=True, timeout=10, check=True)
+    elsewhere = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE")  # set inside git's own hooks, for another repository
+    environment = {name: value for name, value in os.environ.items() if name not in elsewhere} | {"LC_ALL": "C"}
+    done = subprocess.run(
+        ["git", *words], cwd=where, env=environment, capture_output=True, encoding="utf-8", errors="replace",
+        timeout=PATIENCE, check=True,
+    )  # fmt: skip
     return done.stdout.strip()

@@ -11,6 +11,7 @@ from ruamel.yaml import YAML, YAMLError
 from torch import Generator, Tensor
 
 from pipelines.errors import InputError
+from pipelines.files import regular
 from pipelines.store import DamagedError, load_whole, one_line, save_atomically, without_replay
 from pipelines.study import RunSpec
 from rhmc.algorithms import ALGORITHMS
@@ -119,6 +120,7 @@ def settings(config: Path) -> tuple[RunSpec, str]:
         InputError: there is none, or it is something else.
     """
     try:
+        regular(config, absent=True)
         tree = YAML(typ="safe", pure=True).load(config.read_text(encoding="utf-8"))
         return _spec(tree), str(tree.get("arm", "policy"))
     except FileNotFoundError as error:
@@ -146,6 +148,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _read(file: Path, spec: RunSpec | None) -> Saved:
+    regular(file, absent=True)
     try:
         state = load_whole(file)
     except FileNotFoundError as error:

@@ -218,7 +218,7 @@ class Bridge(tune.Callback):
     def _died(self, key: str, trial: Trial) -> str:
         """Count the death of a worker, and say what Ray wrote of all of them."""
         self.live.discard(key)
-        trace = Path(trial.error_file).read_text() if trial.error_file else ""
+        trace = Path(trial.error_file).read_text(encoding="utf-8", errors="replace") if trial.error_file else ""
         place = self.places.pop(key, None)
         self.deaths[key].add(place.node if place else "", trace.rpartition("Failure #")[2])
         return trace

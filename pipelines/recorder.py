@@ -3,10 +3,10 @@
 from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from pipelines.decoration import EPISODE, WHY_NOT, decoration
+from pipelines.litter import scratch
 from pipelines.overview import Overview
 from pipelines.plan import Item, finished, resolved_yaml
 from pipelines.policy import CONFIG, FILE
@@ -94,15 +94,14 @@ class Recorder:
             log = self.tracker.start(item.card)
             log.log(points)
             log.text(CONFIG, resolved_yaml(item, self.study))
-            with TemporaryDirectory() as folder:
+            with scratch() as folder:
                 with decoration(f"{item.name}: its animation", self.board.say):
                     for name in EXTRAS:
-                        self.tracker.file(source, name, Path(folder))
-                (Path(folder) / CONFIG).write_text(
-                    resolved_yaml(item, self.study), encoding="utf-8"
-                )  # for a policy without its spec
-                if self.tracker.file(source, FILE, Path(folder)):
-                    keep(log, Path(folder), item.name, self.board.say)
+                        self.tracker.file(source, name, folder)
+                config = resolved_yaml(item, self.study)  # for a policy without its spec
+                (folder / CONFIG).write_text(config, encoding="utf-8")
+                if self.tracker.file(source, FILE, folder):
+                    keep(log, folder, item.name, self.board.say)
                 else:
                     log.tag(VALUES_ONLY, "yes")
             log.tag("reused_from", source)

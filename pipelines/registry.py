@@ -2,9 +2,11 @@
 
 import json
 import re
+import urllib.parse
+import urllib.request
 import warnings
+from contextlib import suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,7 @@ from mlflow.models import Model, ModelSignature
 from mlflow.types import ColSpec, Schema, TensorSpec
 from mlflow.utils.mlflow_tags import MLFLOW_MODEL_VERSIONS
 
+from pipelines.litter import remove, scratch
 from pipelines.names import PROFILES, slug
 from pipelines.policy import FILE, Saved, load, save, sizes
 from pipelines.study import RunSpec
@@ -92,6 +95,8 @@ def _logged(
         if made is None and there.status == LoggedModelStatus.READY:
             made = there
         else:
+            if there.status != LoggedModelStatus.READY:
+                _remove_files(there.artifact_location)
             client.delete_logged_model(there.model_id)
     saved = load(policy)
     if made is None:
@@ -102,12 +107,22 @@ def _logged(
     return made
 
 
+def _remove_files(location: str) -> None:
+    """Remove what a killed launch copied of a model, where files are kept in a folder: MLflow leaves them for good."""
+    address = urllib.parse.urlsplit(location)
+    if address.scheme in ("", "file"):
+        folder = Path(urllib.request.url2pathname(address.path))
+        remove(folder)
+        with suppress(OSError):
+            folder.parent.rmdir()
+
+
 def _written(
     client: MlflowClient, run: str, experiment: str, name: str, tags: dict[str, str], saved: Saved
 ) -> LoggedModel:
     spec = saved.spec
     made = client.create_logged_model(experiment, name, run, tags, model_type="policy")
-    with TemporaryDirectory() as folder:
+    with scratch() as folder:
         local, file = str(Path(folder) / "model"), Path(folder) / FILE
         save(file, saved)
         save_model(

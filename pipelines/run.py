@@ -19,7 +19,7 @@ from pipelines.fingerprint import fingerprint
 from pipelines.host import Host, host
 from pipelines.limits import absent
 from pipelines.origin import another, remember
-from pipelines.plan import Item, commit, finished, given_twice, items, study_card
+from pipelines.plan import Item, finished, given_twice, items, read_commit, study_card
 from pipelines.progress import Board, board, print_table
 from pipelines.ray_settings import set_up_ray
 from pipelines.recorder import Recorder
@@ -177,7 +177,10 @@ def _launch(studies: Sequence[Study], home: Home, interrupts: Interrupts) -> int
             if remark := another(home, study.name, study.profile, study.file):
                 display.say(remark)
             remember(home, study.name, study.profile, study.file)
-        code = Code(fingerprint(), commit(), host())
+        known = read_commit()
+        if known.why:
+            display.say(f"the commit is logged as unknown: {known.why}")
+        code = Code(fingerprint(), known.name, host())
         launched = [logs.enter_context(_logged(study, code, home, display)) for study in studies]
         recorders = Recorders([one.recorder for one in launched])
         if skipped := sum(one.skipped for one in recorders.each):

@@ -23,7 +23,7 @@ from pipelines.errors import InputError, visible
 from pipelines.fingerprint import fingerprint
 from pipelines.found import file_name, stem, winner_yaml, write_text
 from pipelines.origin import another, remember
-from pipelines.plan import commit
+from pipelines.plan import read_commit
 from pipelines.progress import Board, StopFile, board, print_table
 from pipelines.ray_settings import set_up_ray
 from pipelines.run import BAD, DONE, FAILED, Interrupts, guarded, missing_devices
@@ -109,6 +109,7 @@ def _launch(search: Search, home: Home, storage: BaseStorage, out: Path, interru
             ledgers = [Ledger(search, arm, code, storage) for arm in search.arms]
             for ledger in ledgers:
                 again = ledger.take_up()
+                _clear(search, ledger, code, home)
                 display.say(f"{ledger.arm}: {ledger.closed} of {search.trials} trials are done, {again} are taken up")
             if any(ledger.left for ledger in ledgers):
                 _train(search, ledgers, Book(search, code, tracker, display), home, interrupts)
@@ -122,6 +123,12 @@ def _launch(search: Search, home: Home, storage: BaseStorage, out: Path, interru
         tracker.close(status)
     _summary(search, ledgers, tracker, written, whole)
     return {"finished": DONE, "failed": FAILED}.get(status, interrupts.code)
+
+
+def _clear(search: Search, ledger: Ledger, code: str, home: Home) -> None:
+    """Remove what a launch left that was killed between closing a trial and removing its checkpoints."""
+    for asked in ledger.over():
+        Checkpoints(home.checkpoints(trial_card(search, asked, code, "").key)).clear_unused()
 
 
 def _train(search: Search, ledgers: Sequence[Ledger], book: "Book", home: Home, interrupts: Interrupts) -> None:
@@ -277,7 +284,9 @@ class Book:
 
     def __init__(self, search: Search, code: str, tracker: Tracker, display: Board) -> None:
         self.search, self.code, self.tracker, self.board = search, code, tracker, display
-        self.commit = commit()
+        self.commit, why = read_commit()
+        if why:
+            display.say(f"the commit is logged as unknown: {why}")
         self.logs: dict[str, RunLog] = {}
 
     def start(self, asked: Asked) -> str:

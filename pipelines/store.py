@@ -17,6 +17,7 @@ from filelock import BaseFileLock, FileLock, Timeout
 
 from pipelines.addresses import scrubbed
 from pipelines.errors import InputError
+from pipelines.litter import part_of, remove
 from rhmc.types import State
 
 GLANCE = 0.5  # seconds that another process may hold a study's lock only to see whether it is free
@@ -83,9 +84,10 @@ class Home:
         Raises:
             StoreError: it cannot.
         """
-        probe = self.root / f".probe-{os.getpid()}"
+        probe = self.root / ".probe"
         try:
             self.root.mkdir(parents=True, exist_ok=True)
+            probe = part_of(probe)
             probe.write_bytes(b"x" * 4096)
             probe.unlink()
         except OSError as error:
@@ -107,11 +109,11 @@ class Home:
         try:
             lock.acquire(timeout=GLANCE)
         except Timeout as error:
-            pid = owner.read_text().strip() if owner.exists() else "unknown"
+            pid = owner.read_text(encoding="utf-8").strip() if owner.exists() else "unknown"
             message = f"{study} ({profile}) is already being run by process {pid} ({path}); wait for it or stop it"
             raise StoreError(message) from error
         try:
-            owner.write_text(f"{os.getpid()} on {socket.gethostname()}\n")
+            owner.write_text(f"{os.getpid()} on {socket.gethostname()}\n", encoding="utf-8")
             yield
         finally:
             lock.release()
@@ -203,7 +205,10 @@ def whole(path: Path, *, durable: bool = False) -> Iterator[Path]:
     Raises:
         StoreError: the disk is full or the folder closed; nothing half-written is left.
     """
-    part = path.with_name(f"{path.name}.{socket.gethostname()}-{os.getpid()}.part")
+    try:
+        part = part_of(path)
+    except OSError as error:
+        raise StoreError(f"{path}: cannot be written: {reason(error)}") from error
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield part
@@ -212,8 +217,7 @@ def whole(path: Path, *, durable: bool = False) -> Iterator[Path]:
         else:
             part.replace(path)
     except BaseException as error:
-        with suppress(OSError):
-            shutil.rmtree(part) if part.is_dir() else part.unlink(missing_ok=True)
+        remove(part)
         if isinstance(error, OSError | RuntimeError):  # torch reports a failed write as RuntimeError
             raise StoreError(f"{path}: cannot be written: {reason(error)}") from error
         raise

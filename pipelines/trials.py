@@ -14,7 +14,7 @@ import math
 import os
 import sqlite3
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -28,6 +28,7 @@ from optuna.trial import FrozenTrial, TrialState
 from sqlalchemy.exc import SQLAlchemyError
 
 from pipelines.addresses import fault, scrubbed, without_password
+from pipelines.litter import part_of, remove
 from pipelines.search import Dimension, Pruner, Sampler, Search, Value
 from pipelines.sqlite import address, connecting, reading_address, settle, sqlite_file
 from pipelines.store import Home, StoreError, one_line
@@ -150,6 +151,15 @@ class Ledger:
         except ValueError as error:
             self._close(place, "pruned", f"refused: {one_line(error)}", TrialState.PRUNED)
             return None
+
+    def over(self) -> list[Asked]:
+        """The trials that nothing more is done for, to be asked after `take_up`."""
+        found = []
+        for place, trial in self.latest().items():
+            if trial.state not in (TrialState.RUNNING, TrialState.WAITING):
+                with suppress(ValueError):  # refused by the method: never trained
+                    found.append(Asked(self.arm, place, trial.params, self.search.arms[self.arm].at(trial.params)))
+        return found
 
     def report(self, trial: Asked, point: Metrics, number: int) -> str:
         """Take in a point of a trial's curve.
@@ -345,13 +355,12 @@ def _create(file: Path) -> None:
     with FileLock(f"{file}.lock"):
         if file.exists() and file.stat().st_size > 0:
             return
-        part = file.with_name(f"{file.name}.part")
-        part.unlink(missing_ok=True)
+        part = part_of(file)
         try:
             RDBStorage(address(part)).engine.dispose()
             part.replace(file)
         finally:
-            part.unlink(missing_ok=True)
+            remove(part)
 
 
 @contextmanager

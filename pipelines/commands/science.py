@@ -7,6 +7,7 @@ import typer
 
 from pipelines.commands.common import Profile, folder_option, profile_faults, say, table, tell
 from pipelines.errors import InputError, visible_lines
+from pipelines.files import fault_of, regular
 from pipelines.limits import EPISODES, SEED
 from pipelines.names import PROFILES, fault_of_study, simple, study_name
 
@@ -56,8 +57,8 @@ def fingerprint(file: Annotated[Path | None, typer.Argument(help="Write it there
         print(text, end="")
         return
     try:
-        if not file.exists() or file.read_text() != text:
-            file.write_text(text)
+        if not file.exists() or regular(file).read_bytes() != text.encode():
+            file.write_text(text, encoding="utf-8")
     except OSError as error:
         raise InputError(f"{file}: cannot be written ({error.strerror})") from error
 
@@ -103,8 +104,8 @@ def report(
     """Build figures, tables, claims and their page from the exported tables; or curves and comparison of one study."""
     if faults := profile_faults(profile):
         raise InputError(*faults)
-    if study is not None and not study.is_file():
-        raise InputError(f"--study: {study} is not a file; a study such as studies/ablation.yaml")
+    if study is not None and (fault := fault_of(study)):
+        raise InputError(f"--study: {study}: {fault}; a study such as studies/ablation.yaml")
     if variant is not None and study is None:
         raise InputError("--variant: belongs to a study; give --study as well")
     if study is not None and (fault := fault_of_study(study_name(study))):

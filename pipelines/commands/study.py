@@ -24,6 +24,7 @@ from pipelines.commands.common import (
     tell,
 )
 from pipelines.errors import InputError
+from pipelines.files import regular
 
 app = typer.Typer(help="Check, run, follow and move studies.", no_args_is_help=True)
 
@@ -136,6 +137,8 @@ def import_runs(
     bundle: Annotated[Path, typer.Argument(metavar="BUNDLE", help="What `rhmc study export` wrote.")],
 ) -> None:
     """Take in runs from another machine: `rhmc study run` then goes on from there."""
+    if not bundle.is_dir():
+        regular(bundle)
     from pipelines.bundle import unpack
     from pipelines.store import StoreError, work_folder
 

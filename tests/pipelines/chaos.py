@@ -17,6 +17,7 @@ import tempfile
 import threading
 import time
 import urllib.request
+from collections.abc import Callable
 from contextlib import nullcontext, suppress
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
@@ -38,6 +39,7 @@ from pipelines.plan import study_card
 from pipelines.recorders import Recorders
 from pipelines.store import Home
 from pipelines.study import Study
+from pipelines.tracker import StudyCard
 from pipelines.trainable import RunTrainable
 from tests.pipelines.support import CODE
 
@@ -67,7 +69,12 @@ class Run(NamedTuple):
 
 def everything(study: Study, home: Path) -> list[Run]:
     """All that a study has logged and its parent, in an order that does not depend on when it was logged."""
-    tracker = open_existing(study_card(study), Home(home))
+    return logged(study_card(study), home)
+
+
+def logged(card: StudyCard, home: Path) -> list[Run]:
+    """See `everything`; of a study or a search."""
+    tracker = open_existing(card, Home(home))
     assert tracker is not None
     found = tracker.client.search_runs([tracker.experiment], "", ViewType.ACTIVE_ONLY, 1000)
     return sorted(_run(tracker.client, one, home) for one in found)
@@ -133,9 +140,12 @@ class Fuse:
 
     def __init__(self, length: int) -> None:
         self.length, self.count = length, 0
+        self.counts: Callable[[], bool] = lambda: True  # whether a write counts now
 
     def tick(self) -> None:
         """A write is about to happen."""
+        if not self.counts():
+            return
         self.count += 1
         if self.count == self.length:
             os.kill(os.getpid(), signal.SIGKILL)
@@ -198,7 +208,7 @@ def start(target: Any, *args: Any) -> ForkServerProcess:
 
 
 def _drive(study: str, home: str, uri: str | None, length: int, room: int | None) -> None:
-    _settle(Path(home) / "driver.log")
+    settle(Path(home) / "driver.log")
     if room:
         resource.setrlimit(resource.RLIMIT_FSIZE, (room, room))
     if uri:
@@ -215,7 +225,7 @@ def _drive(study: str, home: str, uri: str | None, length: int, room: int | None
 
 
 def _import(bundle: str, home: str, length: int, room: int | None) -> None:
-    _settle(Path(home) / "driver.log")
+    settle(Path(home) / "driver.log")
     if room:
         resource.setrlimit(resource.RLIMIT_FSIZE, (room, room))
     fuse = Fuse(length)
@@ -228,7 +238,7 @@ def _import(bundle: str, home: str, length: int, room: int | None) -> None:
     (Path(home) / "writes").write_text(str(fuse.count))
 
 
-def _settle(log: Path) -> None:
+def settle(log: Path) -> None:
     """Write to the log, and end when the tests do, however they do."""
     handle = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     os.dup2(handle, 1)
@@ -299,7 +309,7 @@ class _Quiet(WSGIRequestHandler):
 
 
 def _serve(home: str, port: int, length: int) -> None:
-    _settle(Path(home) / "server.log")
+    settle(Path(home) / "server.log")
     logging.getLogger("alembic").setLevel(logging.ERROR)
     os.environ["_MLFLOW_SERVER_FILE_STORE"] = f"sqlite:///{home}/mlflow.db"
     os.environ["_MLFLOW_SERVER_ARTIFACT_ROOT"] = "mlflow-artifacts:/"
