@@ -21,7 +21,7 @@ from filelock import FileLock, Timeout
 from pydantic import ValidationError
 
 from pipelines.export import write_parquet
-from pipelines.fingerprint import fingerprint
+from pipelines.identity import fingerprint
 from pipelines.plan import Item, commit, finished, items, resolved_yaml, study_card
 from pipelines.policy import CONFIG, FILE
 from pipelines.recorder import keep
@@ -110,7 +110,7 @@ def pack(study: Study, out: Path, home: Path, *, values_only: bool = False) -> P
         raise StoreError(f"{out}: is there already; name a new one")
     place, card = Home(home), study_card(study)
     tracker = open_existing(card, place)
-    plan = items(study, fingerprint(), "")
+    plan = items(study)
     with TemporaryDirectory() as name:
         folder = Path(name)
         try:

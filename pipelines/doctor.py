@@ -116,7 +116,7 @@ def store(home: Home) -> Iterator[Finding]:
     if runs is None:
         yield Finding("ok", "store", f"{without_password(uri)}: nothing logged yet")
         return
-    from pipelines.fingerprint import fingerprint
+    from pipelines.identity import fingerprint
 
     here = fingerprint()
     yield Finding("ok", "store", f"{without_password(uri)}: {len(runs)} runs")

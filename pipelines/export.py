@@ -11,7 +11,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipelines.errors import InputError
-from pipelines.fingerprint import fingerprint
 from pipelines.host import Host
 from pipelines.plan import Item, items, study_card
 from pipelines.store import Home, StoreError, whole, work_folder
@@ -67,7 +66,7 @@ def export_study(study: Study, out: Path, home: Path | None = None) -> int:
 
     try:
         tracker = open_existing(study_card(study), Home(home or work_folder()))
-        plan = items(study, fingerprint(), "")
+        plan = items(study)
         unfinished = write_tables(study, plan, tracker, out)
     except StoreError as error:
         print(f"rhmc: {error}", file=sys.stderr)

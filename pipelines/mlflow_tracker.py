@@ -199,12 +199,12 @@ class MlflowTracker:
         """See `Tracker`."""
         return [run for _, run in self._listed([self.experiment] if self.experiment else [])]
 
-    def finished_anywhere(self, fingerprint: str) -> dict[str, str]:
+    def finished_anywhere(self, keys: Collection[str]) -> dict[str, str]:
         """See `Tracker`."""
         with explained(self.uri):
             everywhere = [e.experiment_id for e in self.client.search_experiments(max_results=1000)]
         runs = [run for _, run in reversed(self._listed(everywhere)) if run.status == "finished"]
-        return {run.key: run.ref for run in runs if run.key.rpartition("-")[2] == fingerprint}
+        return {run.key: run.ref for run in runs if run.key in keys}
 
     def _listed(self, experiments: Sequence[str]) -> list[tuple[str, Recorded]]:
         """Experiment and run of all runs there, oldest first."""

@@ -75,7 +75,7 @@ class Recorder:
         """Copy what was finished already, for another arm or in another study, instead of training it again."""
         if not self.waiting:
             return
-        there = self.tracker.finished_anywhere(self.plan[0].card.fingerprint)
+        there = self.tracker.finished_anywhere(self.waiting)
         for key in [key for key in self.waiting if key in there]:
             self.adopt(key, there[key])
             Checkpoints(self.home.checkpoints(key)).clear_unused()

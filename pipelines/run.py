@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, NamedTuple, Self
 from rich.console import Console
 
 from pipelines.errors import InputError
-from pipelines.fingerprint import fingerprint
 from pipelines.host import Host, host
 from pipelines.plan import Item, commit, finished, items, study_card
 from pipelines.progress import Board, board, print_table
@@ -144,9 +143,8 @@ class Interrupts:
 
 
 class Code(NamedTuple):
-    """What a launch runs, and where: the same for all of its studies."""
+    """What a launch says of its runs: the same for all of its studies."""
 
-    fingerprint: str
     commit: str
     host: Host
 
@@ -161,7 +159,7 @@ class Launched(NamedTuple):
 
 def _launch(studies: Sequence[Study], home: Home, interrupts: Interrupts) -> int:
     with board(Console()) as display, ExitStack() as logs:
-        code = Code(fingerprint(), commit(), host())
+        code = Code(commit(), host())
         launched = [logs.enter_context(_logged(study, code, home, display)) for study in studies]
         recorders = Recorders([one.recorder for one in launched])
         if skipped := sum(one.skipped for one in recorders.each):
@@ -323,7 +321,7 @@ def _status(study: Study, home: Home) -> tuple[dict[str, dict[str, int]], bool]:
 
     tracker = open_existing(study_card(study), home)
     recorded = tracker.recorded() if tracker else []
-    plan = items(study, fingerprint(), "")
+    plan = items(study)
     # Runs of a driver that was killed are logged as running; a log in this folder knows no other driver than one here.
     own = tracker is not None and tracker.uri == f"sqlite:///{home.database}"
     seen = {"running": "interrupted"} if own and not home.driven(study.name, study.profile) else {}

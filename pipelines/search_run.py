@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 from rich.console import Console
 from ruamel.yaml import YAML
 
-from pipelines.fingerprint import fingerprint
 from pipelines.found import file_name, slug, winner_yaml, write_text
+from pipelines.identity import fingerprint
 from pipelines.plan import commit
 from pipelines.progress import Board, StopFile, board, print_table
 from pipelines.ray_settings import set_up_ray

@@ -110,8 +110,8 @@ class Tracker(Protocol):
         """The runs logged so far, oldest first."""
         ...
 
-    def finished_anywhere(self, fingerprint: str) -> dict[str, str]:
-        """Key -> ref of a finished run, of whatever study shares the log."""
+    def finished_anywhere(self, keys: Collection[str]) -> dict[str, str]:
+        """Key -> ref of a finished run with one of these keys, of whatever study shares the log."""
         ...
 
     def mark(self, ref: str, *, stale: bool) -> None:
@@ -229,9 +229,9 @@ class MemoryTracker:
         else:
             run.tags.pop("stale", None)
 
-    def finished_anywhere(self, fingerprint: str) -> dict[str, str]:
+    def finished_anywhere(self, keys: Collection[str]) -> dict[str, str]:
         """See `Tracker`."""
-        done = [r for r in self.shelf if r.status == "finished" and r.card.fingerprint == fingerprint]
+        done = [r for r in self.shelf if r.status == "finished" and r.card.key in keys]
         return {r.card.key: r.ref for r in reversed(done)}
 
     def start(self, card: Card) -> MemoryRun:
