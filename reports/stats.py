@@ -127,6 +127,21 @@ def welch(x: Values, y: Values) -> float:
     return float(ttest_ind(x, y, equal_var=False).pvalue)
 
 
+def equivalence(x: Values, y: Values, margin: float) -> float:
+    """p of two one-sided Welch tests that the means differ by less than `margin`: below 0.05 they are level.
+
+    NaN below two values in a sample; 0 or 1 where there is no spread at all.
+    """
+    x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
+    if min(len(x), len(y)) < 2:
+        return float("nan")
+    if np.ptp(x) == 0 and np.ptp(y) == 0:
+        return float(abs(x[0] - y[0]) >= margin)
+    below = ttest_ind(x, y - margin, equal_var=False, alternative="greater").pvalue
+    above = ttest_ind(x, y + margin, equal_var=False, alternative="less").pvalue
+    return float(max(below, above))
+
+
 def holm(p: Values) -> Values:
     """p values corrected for how many they are (Holm 1979): below 0.05 together at most once in twenty families.
 
