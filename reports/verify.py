@@ -71,10 +71,11 @@ def compare(here: pd.DataFrame, published: pd.DataFrame, margin: float = MARGIN)
     """
     mine = dict(iter(here.groupby(["study", "arm"])))
     empty = here.iloc[:0]
-    return [_arm(key, mine.get(key, empty), theirs, margin) for key, theirs in published.groupby(["study", "arm"])]
+    return [_arm(mine.get(key, empty), theirs, margin) for key, theirs in published.groupby(["study", "arm"])]
 
 
-def _arm(key: tuple[str, str], here: pd.DataFrame, published: pd.DataFrame, margin: float) -> Compared:
+def _arm(here: pd.DataFrame, published: pd.DataFrame, margin: float) -> Compared:
+    key = str(published["study"].iloc[0]), str(published["arm"].iloc[0])
     seeds = sorted(set(published["seed"]))
     missing = [seed for seed in seeds if seed not in set(here["seed"])]
     here = here[here["seed"].isin(seeds)]
