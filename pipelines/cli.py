@@ -10,7 +10,7 @@ import sys
 
 import typer
 
-from pipelines.commands import doctor, evaluate, render, science, search, study, ui, yardsticks
+from pipelines.commands import doctor, evaluate, render, science, search, study, ui, verify, yardsticks
 from pipelines.commands.common import BAD, DONE, INTERRUPTED
 from pipelines.errors import InputError
 
@@ -34,6 +34,7 @@ app.command("transfer", rich_help_panel=RESULTS)(evaluate.transfer)
 app.command("assignments", rich_help_panel=RESULTS)(evaluate.assignments)
 app.command("render", rich_help_panel=RESULTS)(render.render)
 app.command("export", rich_help_panel=RESULTS)(study.export)
+app.command("verify", rich_help_panel=RESULTS)(verify.verify)
 app.command("report", rich_help_panel=RESULTS)(science.report)
 app.command("ui", rich_help_panel=RESULTS)(ui.ui)
 app.command("theorem", rich_help_panel=RESULTS)(science.theorem)

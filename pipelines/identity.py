@@ -40,6 +40,11 @@ def modules(method: str, task: str, plugins: Iterable[str] = ()) -> Mapping[str,
     return code.closure([TRAINER, *pages, *(name for name in code.sources if _top(name) in set(plugins))])
 
 
+def present() -> frozenset[str]:
+    """What the code of a run can be called here: of every method in every task."""
+    return frozenset(code_id(method, task) for method in ALGORITHMS for task in ENVS)
+
+
 def fingerprint() -> str:
     """12 hex digits over all of `rhmc`: what a pipeline's stages and the nodes of a cluster have to agree on."""
     code = _code(frozenset({PACKAGE}))

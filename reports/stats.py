@@ -23,7 +23,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 from scipy.optimize import brentq
-from scipy.stats import mannwhitneyu, norm, t, trim_mean, ttest_ind
+from scipy.stats import mannwhitneyu, norm, t, trim_mean, ttest_1samp, ttest_ind
 
 SEED = 20_240
 RESAMPLES = 40_000  # the cut tails of few seeds are thin
@@ -139,6 +139,17 @@ def equivalence(x: Values, y: Values, margin: float) -> float:
         return float(abs(x[0] - y[0]) >= margin)
     below = ttest_ind(x, y - margin, equal_var=False, alternative="greater").pvalue
     above = ttest_ind(x, y + margin, equal_var=False, alternative="less").pvalue
+    return float(max(below, above))
+
+
+def equivalence_of_pairs(gaps: Values, margin: float) -> float:
+    """As `equivalence`, of differences between values that belong together. gaps: (n,)."""
+    if len(gaps) < 2:
+        return float("nan")
+    if np.ptp(gaps) == 0:
+        return float(abs(gaps[0]) >= margin)
+    below = ttest_1samp(gaps, -margin, alternative="greater").pvalue
+    above = ttest_1samp(gaps, margin, alternative="less").pvalue
     return float(max(below, above))
 
 

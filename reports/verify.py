@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from reports.frame import FINAL, TableError
-from reports.stats import Interval, Values, difference, equivalence
+from reports.stats import Interval, Values, difference, equivalence, equivalence_of_pairs
 
 MARGIN = 1.0  # points of return
 LEVEL = 0.05
@@ -93,6 +93,33 @@ def _arm(here: pd.DataFrame, published: pd.DataFrame, margin: float) -> Compared
     return Compared(*key, outcome, len(seeds), difference(x, y), p, f"first difference: {first}")
 
 
+def compare_runs(here: pd.DataFrame, published: pd.DataFrame, margin: float = MARGIN) -> list[Compared]:
+    """Each run here against its published self; where some differ, the differences of their finals are tested together.
+
+    Args:
+        here: values of some of the published runs.
+        published: values.
+        margin: in units of return.
+    """
+    place = ["study", "arm", "seed"]
+    theirs = dict(iter(published.groupby(place)))
+    pairs = [(mine, theirs[key]) for key, mine in here.groupby(place)]
+    firsts = [next(differing(mine, other), None) for mine, other in pairs]
+    gaps = [finals(mine) - finals(other) for mine, other in pairs]
+    moved = [float(gap[0]) for gap, first in zip(gaps, firsts, strict=True) if first]
+    p = equivalence_of_pairs(np.array(moved), margin)
+    return [_run(mine, first, float(gap[0]), p) for (mine, _), first, gap in zip(pairs, firsts, gaps, strict=True)]
+
+
+def _run(here: pd.DataFrame, first: "Difference | None", gap: float, p: float) -> Compared:
+    study, arm, seed = here.iloc[0][["study", "arm", "seed"]]
+    name = (str(study), f"{arm}, seed {seed}")
+    if first is None:
+        return Compared(*name, "byte-equal", 1, NOTHING, float("nan"), "")
+    outcome: Outcome = "equivalent" if p < LEVEL else "not shown to be equivalent"
+    return Compared(*name, outcome, 1, Interval(gap, float("nan"), float("nan"), 1), p, f"first difference: {first}")
+
+
 class Difference(NamedTuple):
     """A value that is not the same."""
 
@@ -144,7 +171,8 @@ def summary(compared: Sequence[Compared], name: str) -> str:
 def _shown(interval: Interval) -> str:
     if np.isnan(interval.value):
         return ""
-    return f"{interval.value:+.2f} [{interval.low:.2f}, {interval.high:.2f}]"
+    ends = "" if np.isnan(interval.low) else f" [{interval.low:.2f}, {interval.high:.2f}]"
+    return f"{interval.value:+.2f}{ends}"
 
 
 def _number(p: float) -> str:

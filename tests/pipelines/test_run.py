@@ -20,12 +20,12 @@ from typing import Any
 import pytest
 import torch
 from filelock import FileLock
+from pipelines.fingerprint import fingerprint
 from rich.console import Console
 from ruamel.yaml import YAML
 
 from pipelines import progress, ray_driver, run, trainable
 from pipelines.export import export_study
-from pipelines.fingerprint import fingerprint
 from pipelines.mlflow_tracker import MlflowTracker, open_existing
 from pipelines.plan import Item, commit, items, study_card, what_varies
 from pipelines.progress import LiveBoard, PlainBoard, duration
