@@ -7,16 +7,19 @@ says from what it was adopted and what was compared.
 """
 
 import struct
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 from pipelines.errors import InputError
-from pipelines.plan import Item, finished
+from pipelines.plan import Item, finished, items, study_card
 from pipelines.policy import CONFIG, settings
+from pipelines.recorder import copy_run
 from pipelines.side_by_side import side_by_side
-from pipelines.tracker import Recorded, Row, Tracker
+from pipelines.store import Home
+from pipelines.study import Study
+from pipelines.tracker import Recorded, Row, StudyCard, Tracker, points_of
 from rhmc.trainer import Trainer, grid_step
 from rhmc.types import Metrics
 
@@ -65,6 +68,60 @@ class Proof(NamedTuple):
     def __str__(self) -> str:
         words = f"seed{'s' * (len(self.seeds) > 1)} {', '.join(map(str, self.seeds))}"
         return f"{words} trained again to step {self.until:,}, {self.values:,} values equal bit for bit"
+
+
+def adopt(
+    study: Study, home: Path, verify: int, until: int | None, jobs: int, say: Callable[[str], None]
+) -> list[Proof]:
+    """Let the older runs of a study count for the present code, arm by arm, where they are repeated bit for bit.
+
+    Args:
+        study: the plan.
+        home: the work folder.
+        verify: runs of each arm that are trained again.
+        until: step to which; None for whole runs.
+        jobs: trainings at a time.
+        say: takes a line on each arm.
+
+    Raises:
+        InputError: nothing can be adopted, or `until` is too small.
+        StoreError: the study is being driven, or the log cannot be used.
+    """
+    from pipelines.mlflow_tracker import MlflowTracker
+
+    place, card, plan = Home(home), study_card(study), items(study)
+    place.prepare()
+    with place.lock(study.name, study.profile):
+        tracker = MlflowTracker(card, place)
+        try:
+            found = older(plan, tracker)
+            if not found:
+                text = "no finished run of other code has the settings of a planned one that is missing"
+                raise InputError(f"{study.name} ({study.profile}): {text}")
+            proofs = []
+            for proof in prove(found, tracker, verify, until, jobs):
+                proofs.append(proof)
+                say(_settle(proof, found[proof.arm], card, tracker))
+            return proofs
+        finally:
+            tracker.close("interrupted" if _left(plan, tracker) else "finished")
+
+
+def _settle(proof: Proof, runs: Sequence[Older], study: StudyCard, tracker: Tracker) -> str:
+    """Copy the runs of an arm under their present names, if the proof allows it; a line on it."""
+    if proof.difference:
+        return f"refused: {proof.difference}"
+    for one in runs:
+        points = points_of(tracker.rows([one.run.ref]))
+        card = one.item.card._replace(commit=one.run.commit, host=one.run.host)  # of what computed it
+        tags = {ADOPTED: f"from code {one.code}: {proof}"}
+        copy_run(tracker, study, one.run.ref, one.item._replace(card=card), points, tags)
+    return f"adopted: {len(runs)} runs of arm '{proof.arm}': {proof}"
+
+
+def _left(plan: Iterable[Item], tracker: Tracker) -> bool:
+    done = finished(tracker.recorded())
+    return any((item.card.arm, item.key) not in done for item in plan)
 
 
 def older(plan: Iterable[Item], tracker: Tracker) -> dict[str, list[Older]]:

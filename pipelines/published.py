@@ -1,4 +1,4 @@
-"""Published results: what the repository holds of a profile, results here in the same form, and runs of it trained anew.
+"""Published results: what the repository holds of a profile, results here in that form, and its runs trained anew.
 
 `reports/published/<profile>` has the finals and curves of a profile that is too quick to keep whole; of the paper
 profile the exported tables themselves are in the repository.
@@ -6,7 +6,7 @@ profile the exported tables themselves are in the repository.
 
 import json
 import random
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -83,13 +83,13 @@ def export_log(studies: Sequence[str], profile: str, home: Path, out: Path) -> N
 
 
 class Again(NamedTuple):
-    """A published run and what training it again gave: rows (step, metric, value)."""
+    """A published run and what training it again gave: (step, metric, value)."""
 
     study: str
     arm: str
     seed: int
     run: str
-    values: Sequence[tuple[int, str, float]]
+    points: Sequence[tuple[int, str, float]]
 
 
 def retrain(runs: pd.DataFrame, count: int, seed: int, jobs: int) -> Iterator[Again]:
@@ -112,7 +112,7 @@ def retrain(runs: pd.DataFrame, count: int, seed: int, jobs: int) -> Iterator[Ag
         yield Again(row["study"], row["arm"], int(row["seed"]), row["run"], values)
 
 
-def _spec(row: dict[str, Any]) -> RunSpec:
+def _spec(row: Mapping[Any, Any]) -> RunSpec:
     name = f"{row['study']}, arm '{row['arm']}', seed {row['seed']}"
     try:
         spec = RunSpec.model_validate(json.loads(row["config"]))

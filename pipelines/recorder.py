@@ -1,6 +1,7 @@
 """From results of training to the log and the board; knows neither Ray nor MLflow."""
 
 from collections import defaultdict
+from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -13,6 +14,7 @@ from pipelines.render import EPISODE, WHY_NOT
 from pipelines.store import Checkpoints, Home
 from pipelines.tracker import Recorded, RunLog, Status, StudyCard, Tracker, points_of
 from rhmc.trainer import grid_step
+from rhmc.types import Metrics
 
 EXTRAS = (EPISODE, WHY_NOT)  # what a training may leave beside its policy
 
@@ -89,17 +91,7 @@ class Recorder:
     def _copy(self, source: str, items: list[Item]) -> None:
         points = points_of(self.tracker.rows([source])) if items else []
         for item in items:
-            log = self.tracker.start(item.card)
-            log.log(points)
-            log.text(CONFIG, resolved_yaml(item, self.study))
-            with TemporaryDirectory() as folder:
-                for name in EXTRAS:
-                    self.tracker.file(source, name, Path(folder))
-                (Path(folder) / CONFIG).write_text(resolved_yaml(item, self.study))  # for a policy without its spec
-                if self.tracker.file(source, FILE, Path(folder)):
-                    keep(log, Path(folder))
-            log.tag("reused_from", source)
-            log.finish("finished")
+            copy_run(self.tracker, self.study, source, item, points, {"reused_from": source})
             self.overview.points(item.card.arm, item.key, points)
             self.overview.ended(item.card.arm, item.key, "finished")
             self.board.say(f"{item.name}: the same training was finished before; copied")
@@ -180,6 +172,24 @@ class Recorder:
     def _end(self, key: str, status: Status) -> None:
         self.logs.pop(key).finish(status)
         self.overview.ended(self.arms[key], key, status)
+
+
+def copy_run(
+    tracker: Tracker, study: StudyCard, source: str, item: Item, points: list[Metrics], tags: Mapping[str, str]
+) -> None:
+    """Log a planned run as finished, with the values and files of another one."""
+    log = tracker.start(item.card)
+    log.log(points)
+    log.text(CONFIG, resolved_yaml(item, study))
+    with TemporaryDirectory() as folder:
+        for name in EXTRAS:
+            tracker.file(source, name, Path(folder))
+        (Path(folder) / CONFIG).write_text(resolved_yaml(item, study))  # for a policy without its spec
+        if tracker.file(source, FILE, Path(folder)):
+            keep(log, Path(folder))
+    for name, value in tags.items():
+        log.tag(name, value)
+    log.finish("finished")
 
 
 def keep(log: RunLog, folder: Path) -> None:

@@ -92,7 +92,7 @@ def _again(trained: "Sequence[Any]", published: "pd.DataFrame", margin: float) -
 
     from reports.verify import compare_runs
 
-    rows = [(one.study, one.arm, one.seed, one.run, *value) for one in trained for value in one.values]
+    rows = [(one.study, one.arm, one.seed, one.run, *value) for one in trained for value in one.points]
     here = pd.DataFrame(rows, columns=["study", "arm", "seed", "run", "step", "metric", "value"])
     return compare_runs(here, published, margin)
 
