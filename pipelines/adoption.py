@@ -9,21 +9,19 @@ says from what it was adopted and what was compared.
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 from pipelines.errors import InputError
 from pipelines.plan import Item, finished, items, study_card
-from pipelines.policy import CONFIG, settings
 from pipelines.recorder import copy_run
 from pipelines.side_by_side import side_by_side
+from pipelines.stale import kept_settings
 from pipelines.store import Home
 from pipelines.study import Study
-from pipelines.tracker import Recorded, Row, StudyCard, Tracker, points_of
+from pipelines.tracker import ADOPTED, Recorded, Row, StudyCard, Tracker, points_of
 from rhmc.trainer import Trainer, grid_step
 from rhmc.types import Metrics
 
-ADOPTED = "adopted"  # tag of an adopted run: from which code, and what was compared
 OURS = "time/"  # metrics that say how long something took
 
 Values = dict[tuple[int, str], float]  # by step and metric
@@ -84,7 +82,7 @@ def adopt(
         say: takes a line on each arm.
 
     Raises:
-        InputError: nothing can be adopted, or `until` is too small.
+        InputError: `until` is too small.
         StoreError: the study is being driven, or the log cannot be used.
     """
     from pipelines.mlflow_tracker import MlflowTracker
@@ -96,8 +94,7 @@ def adopt(
         try:
             found = older(plan, tracker)
             if not found:
-                text = "no finished run of other code has the settings of a planned one that is missing"
-                raise InputError(f"{study.name} ({study.profile}): {text}")
+                say("no finished run of other code has the settings of a planned one that is missing")
             proofs = []
             for proof in prove(found, tracker, verify, until, jobs):
                 proofs.append(proof)
@@ -148,12 +145,8 @@ def older(plan: Iterable[Item], tracker: Tracker) -> dict[str, list[Older]]:
 
 def _settings_id(run: Recorded, tracker: Tracker) -> str:
     """What the settings that a run kept are called today; empty where they cannot be read."""
-    with TemporaryDirectory() as folder:
-        file = tracker.file(run.ref, CONFIG, Path(folder))
-        try:
-            return settings(file)[0].id if file else ""
-        except InputError:
-            return ""
+    spec = kept_settings(run, tracker)
+    return spec.id if spec else ""
 
 
 def prove(

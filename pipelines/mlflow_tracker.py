@@ -25,7 +25,7 @@ from pipelines import legend, names, views
 from pipelines.errors import InputError
 from pipelines.host import Host
 from pipelines.store import Home, StoreError, one_line, replace_durably, sync, without_password
-from pipelines.tracker import Card, Recorded, Row, Status, StudyCard, unseen
+from pipelines.tracker import ADOPTED, Card, Recorded, Row, Status, StudyCard, unseen
 from rhmc.types import Metrics
 
 os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
@@ -54,6 +54,7 @@ PATIENCE = 20.0  # seconds that a reader waits for a writer of SQLite, as MLflow
 DATABASES = ("postgresql", "mysql", "mssql")  # with a server, that MLflow can write to itself
 NOTE = "mlflow.note.content"  # the tag that MLflow shows as a description
 LONGEST = 8000  # characters of a run's tag
+MODULES = "modules"  # tag of a run: the digests of its code as JSON
 ARMS = "arms"  # the experiment's tag with its arms as JSON, in the order in which they came: it decides their colours
 COLOURED = 100  # arms that the tag has room for; a view shows no more
 
@@ -269,6 +270,7 @@ class MlflowTracker:
                 "fingerprint": card.fingerprint,
                 "commit": card.commit,
             }
+            | ({MODULES: json.dumps(dict(card.modules))} if card.modules else {})
             | {name: value for name, value in card.host._asdict().items() if value}
         )
 
@@ -519,7 +521,10 @@ def _recorded(ref: str, status: str, tags: Mapping[str, str]) -> Recorded:
     known: dict[str, str] = defaultdict(str, tags)
     key = f"{known['spec']}-{known['fingerprint']}"
     stale, host = views.STALE in tags, Host(known["machine"], known["versions"])
-    return Recorded(ref, known["variant"], key, FROM_MLFLOW[status], known["commit"], stale, host)
+    modules: Mapping[str, str] = json.loads(known[MODULES] or "{}")
+    return Recorded(
+        ref, known["variant"], key, FROM_MLFLOW[status], known["commit"], stale, host, modules, known[ADOPTED]
+    )
 
 
 # What may be in the way

@@ -13,7 +13,7 @@ from ruamel.yaml.comments import CommentedSeq
 from pipelines.document import choices
 from pipelines.errors import InputError
 from pipelines.host import Host
-from pipelines.identity import code_id
+from pipelines.identity import combined, modules
 from pipelines.study import RunSpec, Study, changes
 from pipelines.tracker import Card, Recorded, StudyCard
 
@@ -50,8 +50,9 @@ def items(study: Study, commit: str = "", where: Host | None = None) -> list[Ite
         algorithm, task = spec.algo.kind, spec.env.kind
         params = {"method": algorithm} | {name: str(flat[name]) for name in varying if name in flat and name != KIND}
         params |= {"seed": str(spec.seed)}
-        code = code_id(algorithm, task)
-        card = Card(run.arm, spec.seed, spec.id, code, algorithm, task, commit, params, host=where or Host())
+        code = modules(algorithm, task)
+        names = (run.arm, spec.seed, spec.id, combined(code.values()), algorithm, task, commit)
+        card = Card(*names, params, host=where or Host(), modules=code)
         planned.append(Item(card, spec, study.name))
     return planned
 

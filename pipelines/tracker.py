@@ -14,6 +14,7 @@ from pipelines.host import Host
 from rhmc.types import Metrics
 
 Status = Literal["running", "finished", "failed", "interrupted"]
+ADOPTED = "adopted"  # tag of a run that other code made: which, and what was compared
 
 
 class StudyCard(NamedTuple):
@@ -39,6 +40,7 @@ class Card(NamedTuple):
     params: dict[str, str]  # what varies between the runs of the study, and method and seed
     trial: int | None = None  # of a search: then the run stands for all of its seeds
     host: Host = Host()  # that starts it
+    modules: Mapping[str, str] = MappingProxyType({})  # digests of the code that decides it
 
     @property
     def key(self) -> str:
@@ -61,6 +63,8 @@ class Recorded(NamedTuple):
     commit: str
     stale: bool = False  # marked as no part of the latest plan
     host: Host = Host()
+    modules: Mapping[str, str] = MappingProxyType({})  # of the code that made it, where that was kept
+    adopted: str = ""  # from which code, and what was compared, if another code made it
 
 
 class Row(NamedTuple):
@@ -217,7 +221,10 @@ class MemoryTracker:
     def recorded(self) -> list[Recorded]:
         """See `Tracker`."""
         return [
-            Recorded(r.ref, r.card.arm, r.card.key, r.status, r.card.commit, "stale" in r.tags, r.card.host)
+            Recorded(
+                *(r.ref, r.card.arm, r.card.key, r.status, r.card.commit, "stale" in r.tags, r.card.host),
+                *(r.card.modules, r.tags.get(ADOPTED, "")),
+            )
             for r in self._mine()
         ]
 
