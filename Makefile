@@ -15,7 +15,6 @@ PIP_TORCH_ARGS ?=
 JOBS ?= 2
 KILLS ?= 60
 SEED ?= 0
-PROFILE := $(shell sed -n 's/^profile: *//p' params.yaml)
 FITS := -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))'
 PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do $$p $(FITS) 2>/dev/null && echo $$p && break; done)
 READY := .venv/.ready
@@ -35,9 +34,10 @@ help: ## What there is to make
 setup: $(READY) ## The environment in .venv, exactly as in requirements.lock
 
 repro: $(READY) ## Train, track and report on the profile in params.yaml; an interrupted one continues
+	@rhmc profile > /dev/null
 	@dvc repro || { echo "Not finished. What is done is kept: \`make repro\` continues."; exit 1; }
 	@echo
-	@echo "Report:    reports/$(PROFILE)/index.html"
+	@echo "Report:    reports/$$(rhmc profile)/index.html"
 	@echo "MLflow UI: run \`make ui\` and open the address that it prints"
 
 test: check ## Lint, types and every test
@@ -56,7 +56,7 @@ soak: $(READY) ## Kill drivers, workers and servers of studies again and again; 
 	@python -m tests.pipelines.soak --kills $(KILLS) --seed $(SEED)
 
 report: $(READY) ## The report again, from the exported runs
-	@rhmc report --profile $(PROFILE)
+	@profile=$$(rhmc profile) && rhmc report --profile "$$profile"
 
 ui: $(READY) ## The runs in MLflow's web interface
 	@rhmc ui

@@ -78,7 +78,7 @@ def peer(agents: int) -> Callable[[], int]:
 def machine() -> str:
     """Which machine and versions the figures belong to, one line."""
     info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.exists() else []
+    lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
     names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
     cpu = names[0] if names else platform.machine()
     return f"One core of {cpu}, Python {platform.python_version()}, torch {torch.__version__}."

@@ -122,7 +122,7 @@ def bare(changes: list[str], out: Path) -> None:
     study = Study.load(STUDY, "quick", changes)
     with ProcessPoolExecutor(CONCURRENT, multiprocessing.get_context("spawn")) as pool:
         runs = list(pool.map(train, [run.spec.canonical() for run in study.runs()]))
-    out.write_text(json.dumps({"runs": runs, "driver": time.process_time(), "parts": {}}))
+    out.write_text(json.dumps({"runs": runs, "driver": time.process_time(), "parts": {}}), encoding="utf-8")
 
 
 # The platform
@@ -196,7 +196,7 @@ def platform(changes: list[str], out: Path) -> None:
         cli.main()
     finally:
         report = {"runs": list(runs.values()), "parts": watch.spent, "driver": time.process_time()}
-        out.write_text(json.dumps(report))
+        out.write_text(json.dumps(report), encoding="utf-8")
 
 
 # Both
@@ -220,13 +220,13 @@ def launch(side: str, minutes: float, home: Path) -> dict[str, Any]:
     environment = os.environ | {"RHMC_HOME": str(home), "OMP_NUM_THREADS": "1"}
     environment["PYTHONPATH"] = f"{ROOT}{os.pathsep}{ROOT / 'benchmarks'}"
     start = time.time()
-    with (home / "log").open("w") as log:
+    with (home / "log").open("w", encoding="utf-8") as log:
         words = [sys.executable, "-W", "ignore", __file__, "--side", side, "--out", str(out), "--minutes", str(minutes)]
         process = subprocess.Popen(words, cwd=ROOT, env=environment, stdout=log, stderr=log, start_new_session=True)
         seen = look(process)
     if process.returncode or not out.exists():
-        sys.exit(f"{side} failed:\n{(home / 'log').read_text()[-3000:]}")
-    report: dict[str, Any] = json.loads(out.read_text())
+        sys.exit(f"{side} failed:\n{(home / 'log').read_text(encoding='utf-8')[-3000:]}")
+    report: dict[str, Any] = json.loads(out.read_text(encoding="utf-8"))
     known = {run["pid"] for run in report["runs"]} | {process.pid}
     others = sum(cpu for pid, cpu in seen.items() if pid not in known) if side == "platform" else 0.0
     return report | {"start": start, "wall": time.time() - start, "others": others}

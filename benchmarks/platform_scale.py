@@ -59,7 +59,7 @@ def write_study(folder: Path, runs: int, points: int) -> Path:
     """A grid of so many runs, a multiple of 1,000 up to 10,000."""
     rates = ", ".join(f"{i}e-4" for i in range(1, runs // 1000 + 1))
     path = folder / "many.yaml"
-    path.write_text(FILE.format(rates=rates, points=points))
+    path.write_text(FILE.format(rates=rates, points=points), encoding="utf-8")
     return path
 
 
@@ -144,7 +144,7 @@ def drive(file: Path, until: int, out: Path) -> None:
     finally:
         memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
         report = {"marks": marks, "ends": ends, "parts": watch.spent, "exit": now(), "memory": memory}
-        out.write_text(json.dumps(report))
+        out.write_text(json.dumps(report), encoding="utf-8")
 
 
 def now() -> list[float]:
@@ -226,13 +226,15 @@ def environment(home: Path) -> dict[str, str]:
 def command(words: list[str], home: Path, codes: tuple[int, ...] = (0, 1)) -> Cost:
     """Run to its end; processor seconds without those of Ray's processes and workers."""
     start = time.perf_counter()
-    with (home / "log").open("w") as log:
+    with (home / "log").open("w", encoding="utf-8") as log:
         python = [sys.executable, "-W", "ignore", *words]
         process = subprocess.Popen(python, cwd=ROOT, env=environment(home), stdout=log, stderr=log)
         _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode not in codes:
-        sys.exit(f"{' '.join(words)} ended with {process.returncode}:\n{(home / 'log').read_text()[-3000:]}")
+        sys.exit(
+            f"{' '.join(words)} ended with {process.returncode}:\n{(home / 'log').read_text(encoding='utf-8')[-3000:]}"
+        )
     return Cost(time.perf_counter() - start, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 2**10)
 
 
@@ -246,7 +248,7 @@ def launch(file: Path, home: Path, until: int) -> Cost:
     out = home / "report.json"
     words = [__file__, "--drive", str(file), "--until", str(until), "--out", str(out)]
     cost = command(words, home, (130,) if until else (0,))
-    report = json.loads(out.read_text())
+    report = json.loads(out.read_text(encoding="utf-8"))
     return Cost(cost.wall, report["exit"][1], report["memory"], report)  # without Ray's processes and workers
 
 
@@ -261,7 +263,7 @@ def server(home: Path) -> Iterator[tuple[str, Callable[[], float]]]:
         port = free.getsockname()[1]
     address = f"http://127.0.0.1:{port}"
     words = [sys.executable, "-W", "ignore", "-m", "pipelines.cli", "ui", "--port", str(port)]
-    with (home / "log").open("w") as log:
+    with (home / "log").open("w", encoding="utf-8") as log:
         process = subprocess.Popen(words, cwd=ROOT, env=environment(home), stdout=log, stderr=log)
     try:
         while process.poll() is None:

@@ -64,7 +64,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         runs, rows = write(Path(folder), args.seeds, args.points)
         before, start = time.process_time(), time.perf_counter()
-        files = build(Path(folder), Path(folder) / "report", "paper")
+        files = build(Path(folder), Path(folder) / "report", "paper").files
         spent, wall = time.process_time() - before, time.perf_counter() - start
         size = sum(file.stat().st_size for file in files) / 2**20
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10

@@ -98,22 +98,25 @@ def adopt(
             proofs = []
             for proof in prove(found, tracker, verify, until, jobs):
                 proofs.append(proof)
-                say(_settle(proof, found[proof.arm], card, tracker))
+                _settle(proof, found[proof.arm], card, tracker, say)
             return proofs
         finally:
             tracker.close("interrupted" if _left(plan, tracker) else "finished")
 
 
-def _settle(proof: Proof, runs: Sequence[Older], study: StudyCard, tracker: Tracker) -> str:
-    """Copy the runs of an arm under their present names, if the proof allows it; a line on it."""
+def _settle(
+    proof: Proof, runs: Sequence[Older], study: StudyCard, tracker: Tracker, say: Callable[[str], None]
+) -> None:
+    """Copy the runs of an arm under their present names, if the proof allows it."""
     if proof.difference:
-        return f"refused: {proof.difference}"
+        say(f"refused: {proof.difference}")
+        return
     for one in runs:
         points = points_of(tracker.rows([one.run.ref]))
         card = one.item.card._replace(commit=one.run.commit, host=one.run.host)  # of what computed it
         tags = {ADOPTED: f"from code {one.code}: {proof}"}
-        copy_run(tracker, study, one.run.ref, one.item._replace(card=card), points, tags)
-    return f"adopted: {len(runs)} runs of arm '{proof.arm}': {proof}"
+        copy_run(tracker, study, one.run.ref, one.item._replace(card=card), points, tags, say)
+    say(f"adopted: {len(runs)} runs of arm '{proof.arm}': {proof}")
 
 
 def _left(plan: Iterable[Item], tracker: Tracker) -> bool:

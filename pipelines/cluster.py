@@ -23,6 +23,7 @@ from ray.exceptions import GetTimeoutError, RayError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from pipelines.identity import PACKAGE, fingerprint, folder_of
+from pipelines.litter import dead, owner, remove
 from pipelines.store import StoreError, one_line
 
 KNOCK = 5.0  # seconds to wait for a cluster to answer
@@ -32,8 +33,12 @@ GONE = 2  # exit code where the head is: something is in the way
 ANSWER = 90.0  # seconds to wait for a node to look around: it may start a process and import torch
 DEATHS = 3  # workers that may die in a row on one training without getting it further
 NODE_DIED = "its node has died"  # in what Ray says of an actor
-HELLO = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\4\0\0\0\0\0"  # how a client of HTTP/2, which gRPC is, begins
-SETTINGS = 4  # the type of the frame that answers it, in its fourth byte
+HELLO = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"  # how a client of HTTP/2, which gRPC is, begins
+DATA, HEADERS, SETTINGS = 0, 1, 4  # types of its frames
+LAST, WHOLE = 1, 4  # flags of frames: of a request, of its headers
+ALIVE = "/ray.rpc.NodeInfoGcsService/CheckAlive"  # what Ray's head answers to anybody, unless it wants a token
+STATUS = b"grpc-status"  # in its answer; the length of a number and the number follow
+REFUSAL = STATUS + b"\x0216"  # of one who has no token
 
 
 def address() -> str:
@@ -43,10 +48,11 @@ def address() -> str:
 
 
 def knock(where: str) -> None:
-    """See that a cluster answers at host:port: Ray itself would try for minutes.
+    """See that a cluster answers at host:port, where Ray itself would try for minutes, and is closed to strangers.
 
     Raises:
-        StoreError: nobody listens there, or something that is not Ray; or an address that cannot be used here.
+        StoreError: nobody listens there, or something that is not Ray; or anybody can run code there, and
+            `RAY_AUTH_MODE=disabled` does not say that this is meant; or an address that cannot be used here.
     """
     if "://" in where:
         raise _refused(where, "only HOST:PORT or auto, from a node of the cluster, can be used")
@@ -54,14 +60,63 @@ def knock(where: str) -> None:
     if not colon or not port.isdigit():
         return
     try:
-        with socket.create_connection((host.strip("[]"), int(port)), KNOCK) as line:
-            line.settimeout(KNOCK)
-            line.sendall(HELLO)
-            answered = line.recv(9)
+        answered = ask(host.strip("[]"), int(port))
     except (OSError, OverflowError) as error:
         raise _refused(where, one_line(error)) from error
-    if answered[3:4] != bytes([SETTINGS]) and os.environ.get("RAY_USE_TLS", "0") == "0":
+    if os.environ.get("RAY_USE_TLS", "0") != "0":
+        return  # who has no certificate gets no answer
+    if answered[3:4] != bytes([SETTINGS]) or not _told(answered):
         raise _refused(where, "what answers there is not Ray")
+    if fault := _mismatch(locked=REFUSAL in answered):
+        raise _refused(where, fault)
+
+
+def ask(host: str, port: int, call: str = ALIVE) -> bytes:
+    """What a program that speaks gRPC answers to a call without a token, as bytes; `STATUS` is in it.
+
+    Raises:
+        OSError: nobody listens, or nothing comes for `KNOCK` seconds.
+    """
+    headers = {":method": "POST", ":scheme": "http", ":path": call, ":authority": "ray", "te": "trailers"}
+    packed = b"".join(_field(*header) for header in (headers | {"content-type": "application/grpc"}).items())
+    request = _frame(SETTINGS, 0, 0, b"") + _frame(HEADERS, WHOLE, 1, packed) + _frame(DATA, LAST, 1, bytes(5))
+    answered = b""
+    with socket.create_connection((host, port), KNOCK) as line:
+        line.settimeout(KNOCK)
+        line.sendall(HELLO + request)
+        while not _told(answered) and (more := line.recv(4096)):
+            answered += more
+    return answered
+
+
+def _told(answered: bytes) -> bool:
+    status = answered.partition(STATUS)[2]
+    return bool(status) and len(status) > status[0]
+
+
+def _frame(kind: int, flags: int, stream: int, body: bytes) -> bytes:
+    return len(body).to_bytes(3, "big") + bytes([kind, flags]) + stream.to_bytes(4, "big") + body
+
+
+def _field(name: str, value: str) -> bytes:
+    """A header as HPACK has it, uncompressed; up to 126 characters each."""
+    return b"".join([b"\0", *(bytes([len(word)]) + word.encode() for word in (name, value))])
+
+
+def _opened() -> bool:
+    return os.environ.get("RAY_AUTH_MODE", "").lower() == "disabled"
+
+
+def _mismatch(*, locked: bool) -> str:
+    """Why a cluster is not joined that asks for a token, or does not; empty if it is."""
+    if locked and _opened():
+        return "it asks for a token, and RAY_AUTH_MODE=disabled gives none: set RAY_AUTH_MODE=token"
+    if not locked and not _opened():
+        return (
+            "it asks nobody for a token, so whoever reaches it can run code on its nodes: start it with "
+            "RAY_AUTH_MODE=token, or set RAY_AUTH_MODE=disabled here if that is meant"
+        )
+    return ""
 
 
 @contextmanager
@@ -127,6 +182,19 @@ def _other_code(found: str, wanted: str) -> str:
     return f"computes with another torch, numpy or code ({found} instead of {wanted}): install requirements.lock there"
 
 
+class Fence(NamedTuple):
+    """What keeps strangers from Ray's head."""
+
+    host: str  # that it listens on
+    locked: bool  # whether it refuses who has no token
+
+
+def fence() -> Fence:
+    """Of the session of this process, found by asking as a stranger does."""
+    host, _, port = ray.get_runtime_context().gcs_address.rpartition(":")
+    return Fence(host, REFUSAL in ask(host.strip("[]"), int(port)))
+
+
 # Nodes
 
 
@@ -160,6 +228,12 @@ def outline(concurrent: int, cpus: int) -> str:
     if not room:
         return f"{text}; waiting for a node that has {cpus} processors for a run"
     return text if room <= concurrent else f"{text} (room for {room}: see resources.concurrent)"
+
+
+def exposed() -> list[str]:
+    """A line on a cluster that was joined although it is open; none if it is not."""
+    text = "the cluster asks nobody for a token (RAY_AUTH_MODE=disabled): whoever reaches it can run code on its nodes"
+    return [text] if _opened() else []
 
 
 class Sight(NamedTuple):
@@ -216,7 +290,10 @@ def survey(home: Path) -> list[str]:
 @contextmanager
 def probing(home: Path) -> Iterator[Path]:
     """A locked file in the work folder; it goes, with what nodes left beside it."""
-    probe = home / f".nodes-{uuid.uuid4().hex}"
+    for left in home.glob(".nodes-*"):
+        if dead("-".join(left.name.split("-")[1:3])):
+            remove(left)
+    probe = home / f".nodes-{owner()}-{uuid.uuid4().hex}"
     try:
         with FileLock(probe):
             yield probe

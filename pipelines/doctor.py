@@ -11,11 +11,13 @@ from typing import Literal, NamedTuple
 
 from packaging.requirements import Requirement
 
-from pipelines.store import Home, StoreError, one_line, without_password
+from pipelines.addresses import without_password
+from pipelines.store import Home, StoreError, one_line
 
 PYTHONS = ((3, 11), (3, 12), (3, 13))  # the first is that of the published results
 NEEDED = 2 * 2**30  # bytes free: a study of many runs with their checkpoints
 LOCK = Path(__file__).parents[1] / "requirements.lock"
+LOOPBACK = "127.0.0.1"
 SHOWN = 4  # libraries that a line names
 
 Level = Literal["ok", "note", "fault"]
@@ -36,7 +38,7 @@ def examine(home: Path, *, ray: bool = True) -> Iterator[Finding]:
         home: the work folder; it need not be there.
         ray: also start Ray, which takes seconds.
     """
-    checks: list[Callable[[], Iterable[Finding]]] = [python, libraries, torch_build, arithmetic]
+    checks: list[Callable[[], Iterable[Finding]]] = [python, libraries, torch_build, arithmetic, code]
     checks += [lambda: disk(home), lambda: store(Home(home)), *([lambda: starts_ray(home)] if ray else [])]
     for check in checks:
         yield from check()
@@ -109,6 +111,16 @@ def arithmetic() -> list[Finding]:
     return [Finding("note", "arithmetic", f"{text} (docs/reproducibility.md)")]
 
 
+def code(where: Path | None = None) -> list[Finding]:
+    """Whether the commit that runs are logged with can be read. where: a folder of the code; this one if None."""
+    from pipelines.plan import read_commit
+
+    found = read_commit(where) if where else read_commit()
+    if found.why:
+        return [Finding("note", "code", f"runs are logged with an unknown commit: {found.why}")]
+    return [Finding("ok", "code", f"commit {found.name}")]
+
+
 def disk(home: Path, needed: int = NEEDED) -> list[Finding]:
     """Room for runs, and the right to write."""
     there = next(folder for folder in (home, *home.parents) if folder.exists())
@@ -167,17 +179,27 @@ def starts_ray(home: Path | None = None) -> list[Finding]:
     from pipelines.ray_settings import set_up_ray
 
     set_up_ray()
-    from pipelines.cluster import address
-    from pipelines.ray_driver import ray_session
+    from pipelines.cluster import address, fence
+    from pipelines.ray_driver import HERE, ray_session
 
     there = home if home and home.is_dir() else None
     try:
         with ray_session(1, home=there) as remarks:
             notes = [Finding("note", "ray", remark) for remark in remarks[1:]]
+            found = fence()
     except StoreError as error:
-        advice = "free memory and /tmp, then try again"
-        if address():
-            advice = "mend or start that cluster, or unset RAY_ADDRESS"
-        return [Finding("fault", "ray", f"{error}: {advice}")]
+        advice = ": mend or start that cluster, or unset RAY_ADDRESS" if address() else ""
+        if str(error).startswith(HERE):
+            advice = ": free memory and /tmp, then try again"
+        return [Finding("fault", "ray", f"{error}{advice}")]
     able = ", and every node can train" if there else ""
-    return [Finding("ok", "ray", f"the cluster at {address()} answers{able}" if address() else "starts"), *notes]
+    if address():
+        return [Finding("ok", "ray", f"the cluster at {address()} answers{able}"), *notes]
+    return [_own(*found)]
+
+
+def _own(host: str, locked: bool) -> Finding:
+    if locked and host == LOOPBACK:
+        return Finding("ok", "ray", f"starts, listens on {host} alone and asks for a token")
+    text = f"starts, but listens on {host} and asks {'' if locked else 'nobody '}for a token: make setup"
+    return Finding("fault", "ray", text)

@@ -9,19 +9,30 @@ import enum
 import json
 import math
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 from ruamel.yaml import YAML
+from ruamel.yaml.composer import Composer, MaxDepthExceededError
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import MappingNode, ScalarNode
 from ruamel.yaml.nodes import Node as YamlNode
 
+from pipelines import limits
+from pipelines.errors import seen
+from pipelines.files import ABSENT, fault_of
+
 LIMIT = 1_000_000  # bytes; larger is no study
 EXACT = 2**53  # floats below it that are whole numbers are read as integers: 5e6 is a number of steps
+DEEPEST = 30  # mappings and lists inside each other
+NODES = 10_000  # keys and values; a thousand arms have fewer, and more takes the reader many seconds
+KEY = 200  # characters of a key
 SHOWN = 60  # characters of an offending value
+LISTED = 50  # names that are offered
+BY_PROFILE = ("quick", "paper")  # keys of a mapping that holds a number for each profile
 PLAIN_TAGS = ("tag:yaml.org,2002:map", "tag:yaml.org,2002:seq")
 
 M = TypeVar("M", bound=BaseModel)
@@ -75,11 +86,13 @@ class Node(NamedTuple):
 def read(path: Path) -> tuple[Node | None, list[Fault]]:
     """The document in a file, and what is wrong with it as YAML. No document means that nothing could be read."""
     source = str(path)
+    if fault := fault_of(path):
+        return None, [Fault(Place(source), "", _unreadable(path, fault))]
     try:
         with path.open("rb") as file:
             data = file.read(LIMIT + 1)
     except OSError as error:
-        return None, [Fault(Place(source), "", _unreadable(path, error))]
+        return None, [Fault(Place(source), "", error.strerror or str(error))]
     if len(data) > LIMIT:
         return None, [Fault(Place(source), "", f"larger than {LIMIT} bytes; a study is a short text")]
     try:
@@ -96,14 +109,16 @@ def override(text: str, path: str, value: str) -> tuple[Node | None, list[Fault]
     return _Reader(text, marks=False).read(value, path)
 
 
-def _unreadable(path: Path, error: OSError) -> str:
-    if path.is_dir():
-        found = sorted(p.name for p in path.glob("*.yaml"))
-        return "a directory; give one study" + (f" of it: {', '.join(found)}" if found else "")
-    if isinstance(error, FileNotFoundError):
-        near = [str(p) for folder in (path.parent, Path("studies")) for p in sorted(folder.glob("*.yaml"))]
-        return "no such file" + nearest(str(path), near)
-    return error.strerror or str(error)
+def _unreadable(path: Path, fault: str) -> str:
+    """What is wrong with a path, and what may have been meant."""
+    with suppress(OSError):
+        if path.is_dir():
+            found = sorted(p.name for p in path.glob("*.yaml"))
+            return "a directory; give one study" + (f" of it: {', '.join(found)}" if found else "")
+        if fault == ABSENT:
+            near = [str(p) for folder in (path.parent, Path("studies")) for p in sorted(folder.glob("*.yaml"))]
+            return fault + nearest(str(path), near)
+    return fault
 
 
 class _Reader:
@@ -113,18 +128,24 @@ class _Reader:
         self.source, self.marks = source, marks
         self.faults: list[Fault] = []
         self.seen: set[int] = set()
+        self.aliased: list[Fault] = []
         self.yaml = YAML(typ="safe", pure=True)
+        self.yaml.Composer = _Composer
+        self.yaml.max_depth = DEEPEST
 
     def read(self, text: str, path: str) -> tuple[Node | None, list[Fault]]:
         try:
             node = self.yaml.compose(text)
             root = self._build(node, path, self._place(node)) if node is not None else None
+            if self.aliased:
+                return None, self.aliased
+        except (MaxDepthExceededError, _TooManyError) as error:
+            text = f"more than {NODES:,} keys and values" if isinstance(error, _TooManyError) else "nested too deeply"
+            return None, [*self.faults, Fault(self._place(error), path, f"{text}; this is no study")]
         except MarkedYAMLError as error:
             return None, [*self.faults, Fault(self._place(error), path, _syntax(error))]
         except YAMLError as error:
             return None, [*self.faults, Fault(Place(self.source), path, f"not YAML: {str(error).splitlines()[0]}")]
-        except RecursionError:
-            return None, [*self.faults, Fault(Place(self.source), path, "nested too deeply to be a study")]
         return root, self.faults
 
     def _place(self, node: Any) -> Place:
@@ -138,9 +159,9 @@ class _Reader:
         value: Any = Unreadable.VALUE
         alias = id(node) in self.seen
         self.seen.add(id(node))
-        if alias:
+        if self.aliased or alias:  # one is told, and nothing else: a file may have a bomb of them
             text = "used again by an alias; aliases are not read here, write the value out"
-            self.faults.append(Fault(key, path, text))  # the node's own place is that of its first use
+            self.aliased = self.aliased or [Fault(key, path, text)]  # the node's own place is that of its first use
         elif isinstance(node, ScalarNode):
             value = self._scalar(node, path)
         elif str(node.tag) not in PLAIN_TAGS:
@@ -149,13 +170,18 @@ class _Reader:
             value = self._mapping(node, path) if isinstance(node, MappingNode) else self._sequence(node, path)
         return Node(value, self._place(node), key, path)
 
-    def _mapping(self, node: MappingNode, path: str) -> dict[str, Node]:
+    def _mapping(self, node: MappingNode, path: str) -> dict[str, Node] | Unreadable:
         children: dict[str, Node] = {}
+        whole = True
         for key, child in node.value:
             if not isinstance(key, ScalarNode):
                 self._fault(key, path, "a key must be a word, not a list or a mapping")
                 continue
             name, place = str(key.value), self._place(key)
+            if fault := _key_fault(name):
+                self._fault(key, path, fault)
+                whole = False
+                continue
             built = self._build(child, join(path, name), place)
             if name in children:
                 first = children[name].key
@@ -163,7 +189,7 @@ class _Reader:
                 self._fault(key, built.path, f"duplicate key {show(name)}, {where}")
             else:
                 children[name] = built
-        return children
+        return children if whole else Unreadable.VALUE
 
     def _sequence(self, node: YamlNode, path: str) -> list[Node]:
         return [self._build(child, join(path, str(i)), self._place(child)) for i, child in enumerate(node.value)]
@@ -180,11 +206,35 @@ class _Reader:
         if isinstance(value, float) and value.is_integer() and abs(value) < EXACT:
             return int(value)
         if isinstance(value, str) and not value.isprintable():
-            return "".join(c if c.isprintable() or c == "\n" else "\N{REPLACEMENT CHARACTER}" for c in value)
+            return "".join(c if seen(c) or c == "\n" else "\N{REPLACEMENT CHARACTER}" for c in value)
         if value is not None and not isinstance(value, str | int | float):
             self._fault(node, path, f"{node.value} is read as a {type(value).__name__}; in quotes it is text")
             return Unreadable.VALUE
         return value
+
+
+class _TooManyError(MarkedYAMLError):
+    """A file of more nodes than `NODES`."""
+
+
+class _Composer(Composer):
+    """Ends the reading of a file that is too large to be read quickly."""
+
+    def __init__(self, loader: Any = None) -> None:
+        super().__init__(loader)
+        self.nodes, self.warn_double_anchors = 0, False
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        self.nodes += 1
+        if self.nodes > NODES:
+            raise _TooManyError(problem_mark=self.parser.peek_event().start_mark)
+        return super().compose_node(parent, index)
+
+
+def _key_fault(name: str) -> str:
+    if len(name) > KEY:
+        return f"a key of {len(name):,} characters, {show(name)}; at most {KEY}"
+    return "" if name.isprintable() else f"the key {show(name)} has characters that cannot be seen; leave them out"
 
 
 def _syntax(error: MarkedYAMLError) -> str:
@@ -232,19 +282,17 @@ def _other_kind(base: Node, patch: Node) -> bool:
 def locate(node: Node, loc: Iterable[str | int]) -> tuple[Node, list[str]]:
     """The deepest written node on the way along `loc`, and the part of the way that is not written."""
     rest = [str(part) for part in loc]
-    while rest:
-        children = dict(enumerate_(node))
-        if rest[0] not in children:
-            break
-        node = children[rest.pop(0)]
+    while rest and (child := _at(node, rest[0])) is not None:
+        node = child
+        rest.pop(0)
     return node, rest
 
 
-def enumerate_(node: Node) -> Iterator[tuple[str, Node]]:
-    """Children of a mapping or a list by the text of their key or index."""
+def _at(node: Node, key: str) -> Node | None:
+    """The child of a mapping or a list at the text of its key or index."""
     if isinstance(node.value, list):
-        yield from ((str(i), child) for i, child in enumerate(node.value))
-    yield from node.children.items()
+        return node.value[int(key)] if key.isdecimal() and int(key) < len(node.value) else None
+    return node.children.get(key)
 
 
 # Validation
@@ -256,10 +304,35 @@ def validate(model: type[M], node: Node, hidden: tuple[str, ...] = ()) -> tuple[
     Strict: no text for a number, no `true` for 1.
     """
     try:
-        return model.model_validate_json(json.dumps(plain(node)), strict=True), []
+        found, faults = model.model_validate_json(json.dumps(plain(node)), strict=True), list[Fault]()
     except ValidationError as error:
-        faults = [_fault(model, node, detail, hidden) for detail in error.errors()]
-        return None, [fault for fault in faults if fault]
+        found, faults = None, [f for detail in error.errors() if (f := _fault(model, node, detail, hidden))]
+    known = {fault.path for fault in faults}
+    beyond = [fault for fault in _beyond(model, node) if fault.path not in known]
+    return (None if beyond else found), faults + beyond
+
+
+def _beyond(model: type[BaseModel], node: Node, name: str = "") -> Iterator[Fault]:
+    """Values that no field may have (`limits`); `name` is that of a mapping whose keys are no names of fields."""
+    for key, child in node.children.items():
+        if key not in model.model_fields:
+            continue
+        inner, field = _inner(model.model_fields[key].annotation), name or key
+        if inner is not None:
+            yield from _beyond(inner, child, "" if set(inner.model_fields) - set(BY_PROFILE) else key)
+            continue
+        for value in _leaves(child):
+            if rule := limits.beyond(field, value.value):
+                yield Fault(value.place, value.path, f"{show(value.value)} is not allowed; {rule}")
+
+
+def _leaves(node: Node) -> Iterator[Node]:
+    """A value, or those in a list."""
+    if isinstance(node.value, list):
+        for child in node.value:
+            yield from _leaves(child)
+    elif not isinstance(node.value, dict):
+        yield node
 
 
 def _fault(model: type[BaseModel], root: Node, error: ErrorDetails, hidden: tuple[str, ...]) -> Fault | None:
@@ -327,7 +400,8 @@ def show(value: Any) -> str:
 def choices(value: Any, allowed: Iterable[str]) -> str:
     """What is allowed instead, and the nearest of it."""
     names = list(allowed)
-    return f"allowed: {', '.join(names)}{nearest(str(value), names)}"
+    more = f" and {len(names) - LISTED:,} more" if len(names) > LISTED else ""
+    return f"allowed: {', '.join(names[:LISTED])}{more}{nearest(str(value), names)}"
 
 
 def nearest(word: str, names: Iterable[str]) -> str:

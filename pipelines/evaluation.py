@@ -3,18 +3,18 @@
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import torch
 
 from pipelines.document import Node, Place, validate
 from pipelines.errors import InputError
+from pipelines.litter import scratch
 from pipelines.plan import Item, chosen, study_card
-from pipelines.policy import CONFIG, FILE, Actor, Saved, load, settings
+from pipelines.policy import CONFIG, FILE, Actor, NoPolicyError, Saved, load, settings
 from pipelines.store import Home
 from pipelines.study import Study
-from pipelines.tracker import Tracker
+from pipelines.tracker import Recorded, Tracker
 from rhmc.algorithms.base import Algorithm
 from rhmc.envs import ENVS, EnvConfig
 from rhmc.evaluate import evaluate
@@ -81,7 +81,7 @@ def task(env: EnvConfig, bank: Bank) -> EnvConfig:
         raise InputError("--targets: in navigation there are as many landmarks as agents; give --agents")
     found, faults = validate(ENVS[env.kind].config, _option(fields, env.kind))
     if found is None:
-        raise InputError("\n".join(str(fault) for fault in faults))
+        raise InputError(*map(str, faults))
     return found
 
 
@@ -110,18 +110,18 @@ def of_study(study: Study, home: Path, arms: Sequence[str] = (), seeds: Sequence
     """The policies of a study's runs: kept ones of the finished, the newest checkpoint of the others.
 
     Raises:
-        InputError: there is no such arm, or no policy at all.
+        InputError: there is no such arm, no policy at all, or a finished run has lost its own.
     """
     plan = chosen(study, arms, seeds)
     from pipelines.mlflow_tracker import open_existing
 
     place = Home(home)
     tracker = open_existing(study_card(study), place)
-    done = {(r.arm, r.key): r.ref for r in tracker.recorded() if r.status == "finished"} if tracker else {}
+    done = {(r.arm, r.key): r for r in tracker.recorded() if r.status == "finished"} if tracker else {}
     found = False
     for item in plan:
-        ref = done.get((item.card.arm, item.key))
-        saved = _kept(tracker, ref, item) if tracker and ref else _begun(place, item)
+        run = done.get((item.card.arm, item.key))
+        saved = _kept(tracker, run, item) if tracker and run else _begun(place, item)
         if saved is not None:
             found = True
             yield Policy(item.card.arm, saved)
@@ -133,19 +133,23 @@ def of_study(study: Study, home: Path, arms: Sequence[str] = (), seeds: Sequence
         raise InputError(f"{study.name} ({study.profile}): {reason}")
 
 
-def _kept(tracker: Tracker, ref: str, item: Item) -> Saved | None:
-    """The policy of a finished run."""
-    with TemporaryDirectory() as folder:
-        file = tracker.file(ref, FILE, Path(folder))
+def _kept(tracker: Tracker, run: Recorded, item: Item) -> Saved | None:
+    """The policy of a finished run; None if it came without one."""
+    with scratch() as folder:
+        file = tracker.file(run.ref, FILE, folder)
+        if file is None:
+            if run.values_only:
+                return None
+            raise InputError(f"{item.name}: its run {run.ref} keeps no {FILE} in {tracker.files_of(run.ref)}")
         try:
-            return load(file, item.spec) if file else None
-        except InputError as error:
-            raise InputError(f"{item.name}: the {FILE} that its run {ref} keeps is damaged") from error
+            return load(file, item.spec)
+        except NoPolicyError as error:
+            raise InputError(f"{item.name}: the {FILE} that its run {run.ref} keeps is damaged") from error
 
 
 def _begun(home: Home, item: Item) -> Saved | None:
     """That of a run under way, which may be training meanwhile."""
-    with suppress(InputError):
+    with suppress(NoPolicyError):
         return load(home.checkpoints(item.key), item.spec)
     return None
 

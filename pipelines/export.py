@@ -10,10 +10,12 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipelines.errors import InputError
+from pipelines.errors import InputError, visible
+from pipelines.files import regular
 from pipelines.host import Host
+from pipelines.origin import another
 from pipelines.plan import Item, items, study_card
-from pipelines.store import Home, StoreError, whole, work_folder
+from pipelines.store import Home, StoreError, lacks_memory, reason, whole, work_folder
 from pipelines.study import Study
 from pipelines.tracker import Recorded, Row, Tracker
 
@@ -34,7 +36,7 @@ RUNS = pa.schema(
         ("arm", pa.string()),
         ("seed", pa.int64()),
         ("run", pa.string()),
-        ("status", pa.string()),  # finished, partial or missing
+        ("status", pa.string()),  # finished, failed, partial or missing
         ("algorithm", pa.string()),
         ("task", pa.string()),
         ("profile", pa.string()),
@@ -45,7 +47,9 @@ RUNS = pa.schema(
         ("seconds", pa.float64()),  # spent training
     ]
 )
-EXPORTED = pa.schema([*RUNS, ("machine", pa.string()), ("versions", pa.string())])  # of a study: what started its runs
+EXPORTED = pa.schema(  # of a study: what started its runs, and from which code those were adopted that older code made
+    [*RUNS, ("machine", pa.string()), ("versions", pa.string()), ("adopted", pa.string())]
+)
 
 
 def export_study(study: Study, out: Path, home: Path | None = None) -> int:
@@ -64,8 +68,11 @@ def export_study(study: Study, out: Path, home: Path | None = None) -> int:
     """
     from pipelines.mlflow_tracker import open_existing
 
+    place = Home(home or work_folder())
+    if remark := another(place, study.name, study.profile, study.file):
+        print(visible(remark), file=sys.stderr)
     try:
-        tracker = open_existing(study_card(study), Home(home or work_folder()))
+        tracker = open_existing(study_card(study), place)
         plan = items(study)
         unfinished = write_tables(study, plan, tracker, out)
     except StoreError as error:
@@ -96,11 +103,11 @@ def write_tables(study: Study, plan: list[Item], tracker: Tracker | None, out: P
 
 
 def _about(study: Study, item: Item, run: Recorded | None, rows: list[Row]) -> tuple[str | float, ...]:
-    status = "missing" if run is None else "finished" if run.status == "finished" else "partial"
+    status = "missing" if run is None else run.status if run.status in ("finished", "failed") else "partial"
     seconds = max((row.value for row in rows if row.metric == "time/seconds"), default=0.0)
     card, commit = item.card, run.commit if run else ""
     names = (status, card.algorithm, card.task, study.profile, item.spec.canonical(), card.fingerprint, commit)
-    return (*names, study.question, seconds, *(run.host if run else Host()))
+    return (*names, study.question, seconds, *(run.host if run else Host()), run.adopted if run else "")
 
 
 def write_parquet(path: Path, schema: pa.Schema, rows: list[tuple[object, ...]]) -> None:
@@ -125,12 +132,16 @@ def read_parquet(path: Path, schema: pa.Schema, what: str) -> list[dict[str, Any
 
     Raises:
         InputError: another file has the name.
+        StoreError: it cannot be read.
     """
     if not path.exists():
         return []
+    regular(path)
     try:
         table = pq.read_table(path)
     except (OSError, pa.ArrowException) as error:
+        if lacks_memory(error) or getattr(error, "errno", None):  # which says nothing of the table
+            raise StoreError(f"{path}: cannot be read now: {reason(error)}") from error
         raise InputError(f"{path}: not a readable table; move it away") from error
     if table.schema.names != schema.names:
         raise InputError(f"{path}: a table, but not one of {what}; move it away")

@@ -3,7 +3,6 @@
 The same search gives the same bytes: no clock, no path of this machine.
 """
 
-import re
 from contextlib import suppress
 from io import StringIO
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 
 from ruamel.yaml import YAML
 
+from pipelines.names import slug
 from pipelines.search import Search
 from pipelines.store import whole
 from pipelines.trials import OBJECTIVE, Best
@@ -18,20 +18,20 @@ from pipelines.trials import OBJECTIVE, Best
 
 def file_name(search: Search, arm: str) -> str:
     """`<search>.<arm>.<profile>.yaml`: a quick search leaves the winner of a long one alone."""
-    return f"{search.name}.{slug(arm)}.{search.profile}.yaml"
+    return f"{search.name}.{stem(arm)}.{search.profile}.yaml"
 
 
-def slug(arm: str) -> str:
-    """An arm's name as part of a file name."""
-    return re.sub(r"[^a-z0-9]+", "-", arm.lower()).strip("-") or "arm"
+def stem(arm: str) -> str:
+    """An arm's name as part of a file name. Lower case: a search has no two arms that differ in case alone."""
+    return slug(arm).lower()
 
 
-def winner_yaml(search: Search, arm: str, best: Best, counts: dict[str, int], fingerprint: str) -> str:
+def winner_yaml(search: Search, arm: str, best: Best, counts: dict[str, int]) -> str:
     """The whole `algo` of the best trial, every default written out, and where it comes from."""
     algo = search.arms[arm].at(best.params).algo
     document = {
         "algo": {"kind": algo.kind} | algo.model_dump(mode="json"),
-        "provenance": _provenance(search, arm, best, counts, fingerprint),
+        "provenance": _provenance(search, arm, best, counts),
     }
     out = StringIO()
     yaml = YAML()
@@ -41,7 +41,7 @@ def winner_yaml(search: Search, arm: str, best: Best, counts: dict[str, int], fi
     return head + out.getvalue()
 
 
-def _provenance(search: Search, arm: str, best: Best, counts: dict[str, int], fingerprint: str) -> dict[str, Any]:
+def _provenance(search: Search, arm: str, best: Best, counts: dict[str, int]) -> dict[str, Any]:
     env = search.arms[arm].setting.env
     return {
         "search": Path(search.file).name,
@@ -50,7 +50,7 @@ def _provenance(search: Search, arm: str, best: Best, counts: dict[str, int], fi
         "profile": search.profile,
         "arm": arm,
         "question": search.question,
-        "fingerprint": fingerprint,
+        "fingerprint": search.code(arm),
         "trials": {"budget": search.trials} | {name: counts[name] for name in ("complete", "pruned", "failed")},
         "steps": search.steps,
         "sampler": search.sampler.model_dump(mode="json"),

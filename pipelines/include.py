@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from pipelines.document import Fault, Node, join, merge, nearest, read, show
+from pipelines.files import ABSENT, fault_of
 
 KEY = "include"
 
@@ -74,9 +75,11 @@ def _source(link: Node, folder: Path, section: str) -> tuple[Node | None, list[F
     if not isinstance(link.value, str):
         return None, [Fault(link.place, link.path, f"{show(link.value)} is not allowed; must be the path of a file")]
     path = folder / link.value
-    if not path.is_file():
+    if (fault := fault_of(path)) == ABSENT:
         near = [p.relative_to(folder).as_posix() for p in sorted(folder.glob("*/*.yaml"))]
-        return None, [Fault(link.place, link.path, f"{path}: no such file{nearest(link.value, near)}")]
+        return None, [Fault(link.place, link.path, f"{path}: {fault}{nearest(link.value, near)}")]
+    if fault:
+        return None, [Fault(link.place, link.path, f"{path}: {fault}")]
     root, faults = read(path)
     if root is None or faults:
         return None, faults or [_empty(link, path, section)]

@@ -7,6 +7,7 @@ import json
 import logging
 import os
 import sqlite3
+import sys
 import time
 import urllib.error
 import urllib.parse
@@ -16,16 +17,20 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from http.client import HTTPException
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from filelock import FileLock
 
-from pipelines import legend, names, views
+from pipelines import legend, moved, names, views
+from pipelines.addresses import fault, scrubbed, without_password
+from pipelines.decoration import decoration
 from pipelines.errors import InputError
+from pipelines.files import ABSENT, fault_of
 from pipelines.host import Host
-from pipelines.store import Home, StoreError, one_line, replace_durably, sync, without_password
-from pipelines.tracker import ADOPTED, Card, Recorded, Row, Status, StudyCard, unseen
+from pipelines.litter import part_of, remove, scratch
+from pipelines.sqlite import address, connect, connecting, reading_address, settle, sqlite_file
+from pipelines.store import Home, StoreError, one_line, replace_durably, sync
+from pipelines.tracker import ADOPTED, VALUES_ONLY, Card, Recorded, Row, Status, StudyCard, unseen
 from rhmc.types import Metrics
 
 os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
@@ -36,6 +41,9 @@ os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "4")  # 28 s: a server 
 from mlflow import MlflowClient
 from mlflow.entities import Experiment, Metric, Param, Run, RunTag, ViewType
 from mlflow.exceptions import MlflowException
+from mlflow.store.artifact.artifact_repo import ArtifactRepository
+from mlflow.store.artifact.artifact_repository_registry import get_artifact_repository
+from mlflow.store.db import utils as database_utils
 from sqlalchemy import create_engine
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.pool import NullPool
@@ -50,18 +58,18 @@ FROM_MLFLOW: dict[str, Status] = {theirs: ours for ours, theirs in STATUS.items(
 SERVER = ("http://", "https://")  # how the address of one begins
 BATCH = 1000  # values that one request may carry
 PARENT = "study"  # tag `role` of the parent run; its runs have `run`
-PATIENCE = 20.0  # seconds that a reader waits for a writer of SQLite, as MLflow's own do
 DATABASES = ("postgresql", "mysql", "mssql")  # with a server, that MLflow can write to itself
 NOTE = "mlflow.note.content"  # the tag that MLflow shows as a description
 LONGEST = 8000  # characters of a run's tag
 MODULES = "modules"  # tag of a run: the digests of its code as JSON
+TRACE = "error.txt"  # a run's file with why it failed
 ARMS = "arms"  # the experiment's tag with its arms as JSON, in the order in which they came: it decides their colours
 COLOURED = 100  # arms that the tag has room for; a view shows no more
 
 
 def tracking_uri(home: Home) -> str:
     """`$MLFLOW_TRACKING_URI`, or SQLite in the work folder."""
-    return os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{home.database}"
+    return os.environ.get("MLFLOW_TRACKING_URI") or address(home.database)
 
 
 def experiment_name(study: StudyCard) -> str:
@@ -83,13 +91,11 @@ class MlflowTracker:
     """
 
     def __init__(self, study: StudyCard, home: Home, *, write: bool = True) -> None:
-        self.study, self.uri = study, tracking_uri(home)
-        check(self.uri)
-        quieten()
+        self.study, self.home, self.uri = study, home, tracking_uri(home)
+        self.remarks: list[str] = []  # what a person should know of this launch
+        self.own = moved.is_own(self.uri, home)
         with explained(self.uri):
-            if self.uri.startswith("sqlite:"):
-                create_database(sqlite_file(self.uri))
-            self.client = MlflowClient(self.uri, self.uri)
+            self.client = (writer if write else reader)(self.uri, home)
             self.experiment = self._experiment(home, write)
             self.arms = self._colour_arms() if write else []
             self.parent = self._parent() if write else None
@@ -105,6 +111,7 @@ class MlflowTracker:
             if not write:
                 return None
             self.client.restore_experiment(found.experiment_id)
+            self.remarks.append(f"experiment {name!r} had been deleted in MLflow: it is restored, with its runs")
         return found.experiment_id if found else None
 
     def _create_experiment(self, name: str, artifacts: str | None) -> str:
@@ -134,15 +141,20 @@ class MlflowTracker:
         if arm not in arms:
             return [(legend.TAG, arm)]
         place = arms.index(arm)
-        return [(legend.TAG, legend.legend(arm, place)), (legend.COLOUR, legend.colour(place))]
+        try:
+            return [(legend.TAG, legend.legend(arm, place)), (legend.COLOUR, legend.colour(place))]
+        except Exception:  # a colour never ends a launch; without one MLflow picks it
+            return [(legend.TAG, arm)]
 
     def _parent(self) -> str:
         ref = self._only("tags.role = 'study'", self.study.study, {"role": PARENT}).info.run_id
         assert self.experiment is not None
-        self._describe(ref, self.study.note)
-        experiment = self.client.get_experiment(self.experiment)
-        legends = [dict(self._look(arm, self.arms))[legend.TAG] for arm in self.study.arms]
-        save_views(self.client, experiment, views.views(self.study.params, legends))
+        with decoration(f"{self.study.study}: description in the log", _note):
+            self._describe(ref, self.study.note)
+        with decoration(f"{self.study.study}: saved views in the log", _note):
+            experiment = self.client.get_experiment(self.experiment)
+            legends = [dict(self._look(arm, self.arms))[legend.TAG] for arm in self.study.arms]
+            save_views(self.client, experiment, views.views(self.study.params, legends))
         self.client.update_run(ref, "RUNNING")
         return ref
 
@@ -245,6 +257,9 @@ class MlflowTracker:
         query = f"tags.role = 'run' and tags.spec = '{card.spec_id}' and tags.fingerprint = '{card.fingerprint}'"
         with explained(self.uri):
             run = self._only(query, card.name, self._tags(card), card.arm)
+            if run.data.tags.get("imported", "") != card.imported:
+                self.drop(run.info.run_id)
+                run = self._only(query, card.name, self._tags(card), card.arm)
             ref = run.info.run_id
             if run.info.status != STATUS["running"]:
                 self.client.update_run(ref, STATUS["running"])
@@ -255,6 +270,13 @@ class MlflowTracker:
                 self.client.log_batch(ref, params=new)
             seen = {(row.metric, row.step) for row in self.rows([ref])} if run.data.metrics else set()
         return MlflowRun(self, card, ref, seen)
+
+    def drop(self, ref: str) -> None:
+        """See `Tracker`. The run lies among MLflow's deleted ones; its model is no longer offered."""
+        with explained(self.uri):
+            for version in self.client.search_model_versions(f"run_id = '{ref}'"):
+                self.client.delete_model_version(version.name, version.version)
+            self.client.delete_run(ref)
 
     def _tags(self, card: Card) -> dict[str, str]:
         return (
@@ -272,6 +294,7 @@ class MlflowTracker:
             }
             | ({MODULES: json.dumps(dict(card.modules))} if card.modules else {})
             | {name: value for name, value in card.host._asdict().items() if value}
+            | ({"imported": card.imported} if card.imported else {})
         )
 
     def rows(self, refs: Sequence[str], metrics: Collection[str] | None = None) -> list[Row]:
@@ -308,12 +331,12 @@ class MlflowTracker:
     def publish(self, note: str, files: Mapping[str, bytes]) -> None:
         """See `Tracker`."""
         assert self.parent is not None
-        with explained(self.uri), TemporaryDirectory() as folder:
+        with explained(self.uri), scratch() as folder:
             self._describe(self.parent, note)
             for name, content in files.items():
                 (Path(folder) / name).write_bytes(content)
             if files:
-                self.client.log_artifacts(self.parent, folder)
+                self.keeps(self.parent).log_artifacts(str(folder))
             take_stock(self.uri)
 
     def close(self, status: Status) -> None:
@@ -331,9 +354,19 @@ class MlflowTracker:
     def file(self, ref: str, name: str, folder: Path) -> Path | None:
         """See `Tracker`."""
         with explained(self.uri):
-            if name not in {kept.path for kept in self.client.list_artifacts(ref)}:
-                return None
-            return Path(self.client.download_artifacts(ref, name, str(folder)))
+            return _copied(self.keeps(ref), name, folder)
+
+    def files_of(self, ref: str) -> str:
+        """Where the files of a run are looked for."""
+        with explained(self.uri):
+            stored = self.client.get_run(ref).info.artifact_uri
+            return str(moved.run_folder(stored, self.home, own=self.own) or stored)
+
+    def keeps(self, ref: str) -> ArtifactRepository:
+        """The files of a run, where they are now."""
+        stored = self.client.get_run(ref).info.artifact_uri
+        there = moved.run_folder(stored, self.home, own=self.own)
+        return get_artifact_repository(there.as_uri() if there else stored, tracking_uri=self.uri)
 
     def where(self) -> str:
         """How to look at the experiment: a command, or a server's address."""
@@ -363,17 +396,19 @@ class MlflowRun:
     def artifact(self, path: Path) -> None:
         """See `RunLog`."""
         with explained(self.uri):
-            self.client.log_artifact(self.ref, str(path))
+            self.tracker.keeps(self.ref).log_artifact(str(path))
 
     def text(self, name: str, content: str) -> None:
         """See `RunLog`."""
-        with explained(self.uri):
-            self.client.log_text(self.ref, content, name)
+        with explained(self.uri), scratch() as folder:  # not `log_text`, whose own folder a kill would leave
+            file = folder / name
+            file.write_text(scrubbed(content) if name == TRACE else content, encoding="utf-8")
+            self.tracker.keeps(self.ref).log_artifact(str(file))
 
     def tag(self, name: str, value: str) -> None:
         """See `RunLog`."""
         with explained(self.uri):
-            self.client.log_batch(self.ref, tags=[RunTag(name, value[:5000])])
+            self.client.log_batch(self.ref, tags=[RunTag(name, scrubbed(value)[:5000])])
 
     def model(self, policy: Path) -> None:
         """See `RunLog`."""
@@ -399,11 +434,15 @@ class MlflowRun:
 
         Where a server keeps the files, that is its business.
         """
-        address = urllib.parse.urlsplit(self.client.get_run(self.ref).info.artifact_uri)
-        folder = Path(urllib.request.url2pathname(address.path))
-        if address.scheme in ("", "file") and folder.is_dir():
+        tracker = self.tracker
+        folder = moved.run_folder(self.client.get_run(self.ref).info.artifact_uri, tracker.home, own=tracker.own)
+        if folder and folder.is_dir():
             for path in (*folder.rglob("*"), folder, *list(folder.parents)[:3]):
                 sync(path)
+
+
+def _note(text: str) -> None:
+    print(f"rhmc: {text}", file=sys.stderr)
 
 
 def fitting(note: str) -> str:
@@ -472,17 +511,17 @@ def fetch(ref: str, wanted: Sequence[str], home: Home, folder: Path) -> list[str
     Raises:
         StoreError: no store, no such run, or the store cannot be read.
     """
-    uri = tracking_uri(home)
-    if uri.startswith("sqlite:") and not sqlite_file(uri).exists():
-        raise StoreError(f"{sqlite_file(uri)}: nothing is logged yet, so there is no run {ref}")
-    check(uri)
-    quieten()
-    with explained(uri):
-        client = MlflowClient(uri, uri)
-        there = [kept.path for kept in client.list_artifacts(ref) if kept.path in wanted]
-        for name in there:
-            client.download_artifacts(ref, name, str(folder))
-    return there
+    log = open_existing(StudyCard("", "", ""), home)
+    if log is None:
+        raise StoreError(f"{sqlite_file(tracking_uri(home))}: nothing is logged yet, so there is no run {ref}")
+    return [name for name in wanted if log.file(ref, name, folder)]
+
+
+def _copied(kept: ArtifactRepository, name: str, folder: Path) -> Path | None:
+    """A copy of a file in a folder, if it is kept."""
+    if name not in {one.path for one in kept.list_artifacts()}:
+        return None
+    return Path(kept.download_artifacts(name, str(folder)))
 
 
 class Counted(NamedTuple):
@@ -499,11 +538,10 @@ def census(home: Home) -> list[Counted] | None:
     Raises:
         StoreError: the store cannot be reached, or is not MLflow's.
     """
-    uri = tracking_uri(home)
-    if uri.startswith("sqlite:") and (not sqlite_file(uri).exists() or sqlite_file(uri).stat().st_size == 0):
-        return None  # asking would make one
-    reader = MlflowTracker(StudyCard("", "", ""), home, write=False)
-    with explained(uri):
+    reader = open_existing(StudyCard("", "", ""), home)
+    if reader is None:
+        return None
+    with explained(reader.uri):
         titles = {e.experiment_id: e.name for e in reader.client.search_experiments(max_results=1000)}
     runs = reader._listed(list(titles))
     return [Counted(titles[experiment], run.status, run.key.rpartition("-")[2]) for experiment, run in runs]
@@ -512,9 +550,54 @@ def census(home: Home) -> list[Counted] | None:
 def open_existing(study: StudyCard, home: Home) -> MlflowTracker | None:
     """The log for reading; None where there is no database yet (MLflow would make one)."""
     uri = tracking_uri(home)
-    if uri.startswith("sqlite:") and not sqlite_file(uri).exists():
+    if uri.startswith("sqlite:") and (not sqlite_file(uri).exists() or sqlite_file(uri).stat().st_size == 0):
         return None
     return MlflowTracker(study, home, write=False)
+
+
+def prepared(home: Home) -> str:
+    """The address of a store that others are about to use: it is one, and knows where the work folder is.
+
+    Raises:
+        StoreError: it cannot be reached, or is not MLflow's.
+    """
+    uri = tracking_uri(home)
+    check(uri)
+    quieten()
+    with explained(uri):
+        if not (uri.startswith("sqlite:") and sqlite_file(uri).stat().st_size == 0):
+            moved.bring_up_to_date(uri, home)
+    return uri
+
+
+def writer(uri: str, home: Home) -> MlflowClient:
+    """MLflow's client of a store that is made if it is not there, with the addresses of files as they are now."""
+    check(uri)
+    quieten()
+    if uri.startswith("sqlite:"):
+        create_database(sqlite_file(uri))
+    moved.bring_up_to_date(uri, home)
+    return MlflowClient(uri, uri)
+
+
+def reader(uri: str, home: Home) -> MlflowClient:
+    """MLflow's client of a store that it can only read.
+
+    Raises:
+        StoreError: a database of another MLflow, which it would bring up to date.
+    """
+    check(uri, write=False)
+    quieten()
+    if not uri.startswith("sqlite:"):
+        return MlflowClient(uri, uri)
+    path = sqlite_file(uri)
+    with closing(connect(path)) as database:
+        (found,) = database.execute("SELECT version_num FROM alembic_version").fetchone() or ("none",)
+    if found != (known := database_utils._get_latest_schema_revision()):
+        text = f"its schema is {found}, that of the MLflow here {known}: it can be read after `mlflow db upgrade`"
+        raise StoreError(f"{path}: the database of another MLflow; {text}")
+    here = reading_address(path)
+    return MlflowClient(here, here)
 
 
 def _recorded(ref: str, status: str, tags: Mapping[str, str]) -> Recorded:
@@ -523,11 +606,16 @@ def _recorded(ref: str, status: str, tags: Mapping[str, str]) -> Recorded:
     stale, host = views.STALE in tags, Host(known["machine"], known["versions"])
     modules: Mapping[str, str] = json.loads(known[MODULES] or "{}")
     return Recorded(
-        ref, known["variant"], key, FROM_MLFLOW[status], known["commit"], stale, host, modules, known[ADOPTED]
+        *(ref, known["variant"], key, FROM_MLFLOW[status], known["commit"], stale, host, known["error"]),
+        *(VALUES_ONLY in tags, modules, known[ADOPTED]),
     )
 
 
 # What may be in the way
+
+
+# MLflow makes the folders of a SQLite address as it is written, with %20 for a space. Ours are there.
+database_utils._make_parent_dirs_if_sqlite = lambda db_uri: None
 
 
 def quieten() -> None:
@@ -536,37 +624,38 @@ def quieten() -> None:
         logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
-def sqlite_file(uri: str) -> Path:
-    """The file of a `sqlite:///` address."""
-    return Path(uri.removeprefix("sqlite:///").split("?")[0])
-
-
-def check(uri: str) -> None:
+def check(uri: str, *, write: bool = True) -> None:
     """See early and cheaply that the store is one.
 
     Raises:
-        StoreError: a file that is not MLflow's, or a server that does not answer.
+        StoreError: a file that is not MLflow's, or that is to be written and cannot; or a server that does not answer.
     """
+    if said := fault("MLFLOW_TRACKING_URI", uri):
+        raise StoreError(said)
     if uri.startswith("sqlite:"):
-        _check_file(sqlite_file(uri))
+        _check_file(sqlite_file(uri), write)
     elif uri.startswith(SERVER):
         _check_server(uri)
     elif "://" not in uri:
-        raise StoreError(f"MLFLOW_TRACKING_URI={uri}: not an address; http://HOST:PORT and sqlite:///FILE are some")
+        shown = without_password(uri)
+        raise StoreError(f"MLFLOW_TRACKING_URI={shown}: not an address; http://HOST:PORT and sqlite:///FILE are some")
     elif uri.partition(":")[0].partition("+")[0] in DATABASES:
         with explained(uri):  # once: MLflow would try for a minute and a half
-            create_engine(uri, poolclass=NullPool).connect().close()
+            create_engine(uri, poolclass=NullPool, connect_args=connecting(uri)).connect().close()
 
 
-def _check_file(path: Path) -> None:
+def _check_file(path: Path, write: bool) -> None:
     advice = "move it away, or name another store in MLFLOW_TRACKING_URI"
+    if (fault := fault_of(path)) and fault != ABSENT:
+        raise StoreError(f"{path}: not an MLflow database: {fault}; {advice}")
     try:
         if not path.exists() or path.stat().st_size == 0:
             if not path.parent.is_dir():
                 raise StoreError(f"{path.parent}: no such folder (for the MLflow database)")
             return
-        if not os.access(path, os.W_OK):
+        if write and not os.access(path, os.W_OK):
             raise StoreError(f"{path}: the MLflow database cannot be written to (read-only)")
+        settle(path)
         with closing(connect(path)) as database:
             tables = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     except (sqlite3.Error, OSError) as error:
@@ -582,15 +671,10 @@ def take_stock(uri: str) -> None:
     MLflow's pages then take seconds instead of a tenth of one.
     """
     if uri.startswith("sqlite:"):
-        with closing(connect(sqlite_file(uri))) as database:
+        with closing(connect(sqlite_file(uri), write=True)) as database:
             database.execute("PRAGMA analysis_limit = 1000")
             database.execute("ANALYZE")
             database.commit()
-
-
-def connect(path: Path) -> sqlite3.Connection:
-    """The database, to read beside whoever writes. Not read-only: a killed writer's journal has to be played back."""
-    return sqlite3.connect(f"file:{path}?mode=rw", PATIENCE, uri=True)
 
 
 def create_database(path: Path) -> None:
@@ -598,13 +682,12 @@ def create_database(path: Path) -> None:
     with FileLock(f"{path}.lock"):
         if path.exists() and path.stat().st_size > 0:
             return
-        part = path.with_name(f"{path.name}.part")
-        part.unlink(missing_ok=True)
+        part = part_of(path)
         try:
-            MlflowClient(f"sqlite:///{part}").search_experiments()
+            MlflowClient(address(part)).search_experiments()
             replace_durably(part, path)
         finally:
-            part.unlink(missing_ok=True)
+            remove(part)
 
 
 def _check_server(uri: str) -> None:

@@ -5,14 +5,21 @@ Means and ranges over seeds only, to look at while a study runs. Intervals and v
 
 import csv
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from io import BytesIO, StringIO
-from typing import NamedTuple
+from textwrap import wrap
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pipelines import legend
+from pipelines.decoration import decoration
 from pipelines.plan import LISTED, Item, more
 from pipelines.tracker import Recorded, Row, Status, StudyCard, Tracker
+from reports.escape import cell, markdown
 from rhmc.types import Metrics
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 PAUSE = 30.0  # seconds between two refreshes while a study runs
 CURVE, FINAL = "eval/return", "final/return"
@@ -23,6 +30,7 @@ FINALS = {
     "final/collisions": "collisions",
 }
 FIGURE, TABLE = "curves.png", "finals.csv"  # artifacts of the parent run
+LETTERS = 40  # of an arm's name on a line of the legend
 MOST = 12  # arms in the figure; more are not told apart
 Point = tuple[int, float]  # step, value
 
@@ -38,17 +46,26 @@ class Run(NamedTuple):
 
 
 class Overview:
-    """Keeps the parent run's description and files up to date.
+    """Keeps the parent run's description and files up to date, as far as that works: a launch does without.
 
     Args:
         study: whose.
         plan: its runs.
         tracker: its log, asked once for the values that earlier launches left there.
         recorded: the runs in it.
+        say: where it is said, once for each part, that it could not be shown.
     """
 
-    def __init__(self, study: StudyCard, plan: Sequence[Item], tracker: Tracker, recorded: Iterable[Recorded]) -> None:
-        self.study, self.tracker = study, tracker
+    def __init__(
+        self,
+        study: StudyCard,
+        plan: Sequence[Item],
+        tracker: Tracker,
+        recorded: Iterable[Recorded],
+        say: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self.study, self.tracker, self.say = study, tracker, say
+        self.told: set[str] = set()
         self.runs = {(item.card.arm, item.key): Run(item.card.arm, item.card.seed, None, (), {}) for item in plan}
         there = {run.ref: run for run in recorded if (run.arm, run.key) in self.runs}
         rows: dict[str, list[Row]] = {ref: [] for ref in there}
@@ -79,7 +96,17 @@ class Overview:
 
     def describe(self) -> None:
         """Refresh the description alone."""
-        self.tracker.publish(self._note(list(self.runs.values())), {})
+        with self._decorating("description"):
+            self.tracker.publish(self._note(list(self.runs.values())), {})
+
+    def _decorating(self, part: str) -> AbstractContextManager[None]:
+        """A part of what the log shows: that it fails is said the first time."""
+        return decoration(f"{self.study.study}: {part} in the log", lambda text: self._once(part, text))
+
+    def _once(self, part: str, text: str) -> None:
+        if part not in self.told:
+            self.told.add(part)
+            self.say(text)
 
     def publish(self) -> None:
         """Refresh the description, the figure and the table."""
@@ -87,8 +114,10 @@ class Overview:
         runs = list(self.runs.values())
         files = {TABLE: table(runs).encode()}
         if any(run.curve for run in runs):
-            files[FIGURE] = figure(self.study, runs)
-        self.tracker.publish(self._note(runs), files)
+            with self._decorating("figure"):
+                files[FIGURE] = figure(self.study, runs)
+        with self._decorating("overview"):
+            self.tracker.publish(self._note(runs), files)
 
     def _note(self, runs: Sequence[Run]) -> str:
         """The question, what is known by now, and the rest of the study's own note."""
@@ -114,7 +143,7 @@ def so_far(runs: Sequence[Run]) -> str:
         done = [run for run in mine if run.status == "finished"]
         seeds = ", ".join(str(run.seed) for run in done) or "none"
         means = [_mean_and_range([run.finals[key] for run in done if key in run.finals]) for key in shown]
-        lines.append(f"| {' | '.join([_cell(arm), seeds, _others(mine), *means])} |")
+        lines.append(f"| {' | '.join([markdown(arm), seeds, _others(mine), *means])} |")
     return "\n".join([f"### So far\n\n{_ahead(runs)}\n", *lines, *more(list(arms))])
 
 
@@ -129,7 +158,8 @@ def _ahead(runs: Sequence[Run]) -> str:
     if len(means) < 2:
         return f"{count}."
     best = max(means, key=lambda arm: means[arm])
-    return f"{count}; the highest mean final return is that of **{best}**. `rhmc report` gives intervals and verdicts."
+    first = f"{count}; the highest mean final return is that of **{markdown(best)}**."
+    return f"{first} `rhmc report` gives intervals and verdicts."
 
 
 def _others(mine: Sequence[Run]) -> str:
@@ -148,10 +178,6 @@ def _mean_and_range(values: Sequence[float]) -> str:
     return f"{mean} ({min(values):.2f} to {max(values):.2f})" if len(values) > 1 else mean
 
 
-def _cell(text: str) -> str:
-    return text.replace("|", "\\|")
-
-
 def table(runs: Sequence[Run]) -> str:
     """CSV: every planned run with its final values."""
     out = StringIO()
@@ -159,7 +185,7 @@ def table(runs: Sequence[Run]) -> str:
     shown = [key for key in FINALS if any(key in run.finals for run in runs)]
     writer.writerow(["arm", "seed", "status", *shown])
     for run in runs:
-        writer.writerow([run.arm, run.seed, run.status or "missing", *(run.finals.get(key, "") for key in shown)])
+        writer.writerow([cell(run.arm), run.seed, run.status or "missing", *(run.finals.get(key, "") for key in shown)])
     return out.getvalue()
 
 
@@ -168,7 +194,20 @@ def figure(study: StudyCard, runs: Sequence[Run]) -> bytes:
 
     An arm without a finished seed is shown by what its seeds have in common so far.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # 1 s, and only where something is finished
+    from matplotlib import rc_context  # 1 s, and only where something is finished
+
+    from reports import letters
+
+    with rc_context(letters.settings()):
+        sheet = _drawn(study, runs)
+        letters.settle(sheet)
+        out = BytesIO()
+        sheet.savefig(out, format="png", dpi=110, metadata={"Software": None})
+    return out.getvalue()
+
+
+def _drawn(study: StudyCard, runs: Sequence[Run]) -> "Figure":
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     sheet = Figure(figsize=(8, 4.5), layout="constrained")
@@ -176,16 +215,17 @@ def figure(study: StudyCard, runs: Sequence[Run]) -> bytes:
     axes = sheet.add_subplot(xlabel="environment steps", ylabel="return of the evaluation bank")
     axes.set_prop_cycle(color=[legend.colour(place) for place in range(MOST)])
     curves = {arm: found for arm, mine in by_arm(runs).items() if (found := _common(mine))}
+    lines, names = [], []  # named in the legend by hand: of itself it leaves out what begins with `_`
     for arm, (seeds, steps, values) in list(curves.items())[:MOST]:
-        axes.plot(steps, [sum(at) / seeds for at in values], lw=1.5, label=f"{arm} ({seeds})")
+        lines += axes.plot(steps, [sum(at) / seeds for at in values], lw=1.5)
+        names.append("\n".join(wrap(f"{arm} ({seeds})", LETTERS)))
         axes.fill_between(steps, [min(at) for at in values], [max(at) for at in values], alpha=0.15, lw=0)
     left = f", {MOST} of {len(curves)} arms" if len(curves) > MOST else ""
     axes.set_title(f"{study.study} ({study.profile}): mean and range over seeds{left}", fontsize=10)
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=8, title="arm (seeds)", title_fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
-    out = BytesIO()
-    sheet.savefig(out, format="png", dpi=110, metadata={"Software": None})
-    return out.getvalue()
+    how: dict[str, Any] = {"title": "arm (seeds)", "loc": "center left", "bbox_to_anchor": (1, 0.5)}
+    axes.legend(lines, names, fontsize=8, title_fontsize=8, **how)
+    return sheet
 
 
 def _common(mine: Sequence[Run]) -> tuple[int, list[int], list[list[float]]] | None:

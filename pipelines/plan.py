@@ -1,6 +1,7 @@
 """What a study asks for, set against what is there."""
 
 import json
+import os
 import subprocess
 from collections.abc import Iterable, Sequence
 from io import StringIO
@@ -14,11 +15,14 @@ from pipelines.document import choices
 from pipelines.errors import InputError
 from pipelines.host import Host
 from pipelines.identity import combined, modules
+from pipelines.names import folded
 from pipelines.study import RunSpec, Study, changes
 from pipelines.tracker import Card, Recorded, StudyCard
+from reports.escape import code, markdown, prose
 
 LISTED = 25  # arms that a description names: MLflow keeps 8,000 characters of one
 RESULTS = (":(top,exclude)dvc.lock", ":(top,exclude,glob)reports/*/**")  # of the pipeline, as git's pathspecs
+PATIENCE = 10.0  # seconds for git to answer
 KIND = "algo.kind"  # which is what the param `method` says
 
 
@@ -65,9 +69,26 @@ def chosen(study: Study, arms: Sequence[str] = (), seeds: Sequence[int] = ()) ->
     """
     faults = [f"--arm: '{arm}' is not allowed; {choices(arm, study.arms)}" for arm in arms if arm not in study.arms]
     if faults:
-        raise InputError("\n".join(faults))
+        raise InputError(*faults)
     plan = items(study)
     return [i for i in plan if (not arms or i.card.arm in arms) and (not seeds or i.card.seed in seeds)]
+
+
+def given_twice(studies: Sequence[Study]) -> list[str]:
+    """Studies of one name, which would have one experiment and one table."""
+    named: dict[str, list[Study]] = {}
+    for study in studies:
+        named.setdefault(folded(study.name), []).append(study)
+    return [
+        f"{same[0].name}: given {len(same)} times{_files(same)}; studies that go together need names of their own"
+        for same in named.values()
+        if len(same) > 1
+    ]
+
+
+def _files(studies: Sequence[Study]) -> str:
+    files = dict.fromkeys(study.file for study in studies)
+    return f" ({', '.join(files)})" if len(files) > 1 else ""
 
 
 def flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -96,9 +117,9 @@ def study_card(study: Study) -> StudyCard:
     steps = sorted({run.spec.trainer.steps for run in runs})
     budget = ", ".join(f"{count:,}" for count in steps)
     note = (
-        f"{study.question}\n\n"
+        f"{prose(study.question)}\n\n"
         f"Profile `{study.profile}`: {len(arms)} arms × {len(seeds)} seeds, {budget} environment steps each.\n\n"
-        + "\n".join([*(f"- **{arm}**: {_differs(study, arm)}" for arm in arms[:LISTED]), *more(arms)])
+        + "\n".join([*(f"- **{markdown(arm)}**: {_differs(study, arm)}" for arm in arms[:LISTED]), *more(arms)])
     )
     return StudyCard(study.name, study.profile, note, _varying([run.spec for run in runs]), arms)
 
@@ -118,7 +139,7 @@ def more(arms: Sequence[str]) -> list[str]:
 def _differs(study: Study, arm: str) -> str:
     """What an arm changes in the base, as code."""
     found = changes(study.base, study.arms[arm])
-    return ", ".join(f"`{name}={value}`" for name, value in found.items()) or "the base"
+    return ", ".join(code(f"{name}={value}") for name, value in found.items()) or "the base"
 
 
 def finished(recorded: Iterable[Recorded]) -> set[tuple[str, str]]:
@@ -145,8 +166,20 @@ def _lists_on_a_line(tree: Any) -> Any:
     return line
 
 
+class Commit(NamedTuple):
+    """The code's commit, with `-dirty` where files differ from it; `unknown` where it cannot be read, and why."""
+
+    name: str
+    why: str = ""
+
+
 def commit(where: Path = Path(__file__).parent) -> str:
-    """The commit of the code, with `-dirty` where files differ from it; `unknown` outside a repository.
+    """The name that `read_commit` finds."""
+    return read_commit(where).name
+
+
+def read_commit(where: Path = Path(__file__).parent) -> Commit:
+    """The commit of the code.
 
     Results are not looked at: `dvc repro` writes its lock and the report's tables after every stage.
 
@@ -156,11 +189,30 @@ def commit(where: Path = Path(__file__).parent) -> str:
     try:
         name = _git(where, "rev-parse", "HEAD")
         changed = _git(where, "status", "--porcelain", "--untracked-files=no", "--", ":/", *RESULTS)
-    except (OSError, subprocess.SubprocessError):
-        return "unknown"
-    return f"{name}-dirty" if changed else name
+    except FileNotFoundError:
+        return Commit("unknown", "git is not installed")
+    except subprocess.TimeoutExpired as error:
+        return Commit("unknown", f"git did not answer within {error.timeout:.0f} s in {where}")
+    except subprocess.CalledProcessError as error:
+        return Commit("unknown", _said(error.stderr, where))
+    except OSError as error:
+        return Commit("unknown", f"git cannot be run: {error.strerror}")
+    return Commit(f"{name}-dirty" if changed else name)
+
+
+def _said(words: str, where: Path) -> str:
+    """What git wrote, and what helps, on one line."""
+    lines = [line.strip() for line in words.splitlines() if line.strip()]
+    remedy = [line for line in lines if line.startswith("git config ")]
+    text = f"git in {where}: {lines[0].removeprefix('fatal: ')}" if lines else f"git failed in {where}"
+    return text + (f"; {remedy[0]} lets you read it" if remedy else "")
 
 
 def _git(where: Path, *words: str) -> str:
-    done = subprocess.run(["git", *words], cwd=where, capture_output=True, text=True, timeout=10, check=True)
+    elsewhere = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE")  # set inside git's own hooks, for another repository
+    environment = {name: value for name, value in os.environ.items() if name not in elsewhere} | {"LC_ALL": "C"}
+    done = subprocess.run(
+        ["git", *words], cwd=where, env=environment, capture_output=True, encoding="utf-8", errors="replace",
+        timeout=PATIENCE, check=True,
+    )  # fmt: skip
     return done.stdout.strip()

@@ -11,7 +11,8 @@ from ruamel.yaml import YAML, YAMLError
 from torch import Generator, Tensor
 
 from pipelines.errors import InputError
-from pipelines.store import load_whole, one_line, save_atomically, without_replay
+from pipelines.files import regular
+from pipelines.store import DamagedError, load_whole, one_line, save_atomically, without_replay
 from pipelines.study import RunSpec
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import ENVS, EnvConfig
@@ -19,6 +20,10 @@ from rhmc.types import Batch, Carry, Obs, Spec, State
 
 FILE, CONFIG = "policy.pt", "config.yaml"  # what a run keeps
 SPEC = "spec"  # key under which a file names its own run, as JSON
+
+
+class NoPolicyError(InputError):
+    """There is no policy, or what was one is damaged."""
 
 
 class Saved(NamedTuple):
@@ -89,11 +94,12 @@ def load(path: Path, spec: RunSpec | None = None) -> Saved:
             `config.yaml` beside it does.
 
     Raises:
-        InputError: there is none, it cannot be read, or nothing says which run it is of.
+        NoPolicyError: there is none, or only damaged ones.
+        InputError: it cannot be read, or nothing says which run it is of.
     """
     files = _files(path)
-    for file in files[:-1]:  # the newest may be damaged, or on its way
-        with suppress(InputError):
+    for file in files[:-1]:  # the newest may be damaged, or dropped meanwhile
+        with suppress(NoPolicyError):
             return _read(file, spec)
     return _read(files[-1], spec)
 
@@ -114,6 +120,7 @@ def settings(config: Path) -> tuple[RunSpec, str]:
         InputError: there is none, or it is something else.
     """
     try:
+        regular(config, absent=True)
         tree = YAML(typ="safe", pure=True).load(config.read_text(encoding="utf-8"))
         return _spec(tree), str(tree.get("arm", "policy"))
     except FileNotFoundError as error:
@@ -136,17 +143,18 @@ def _files(path: Path) -> list[Path]:
         return [path]
     found = [path / FILE] if (path / FILE).exists() else sorted(path.glob("[0-9]*.pt"), reverse=True)
     if not found:
-        raise InputError(f"{path}: no {FILE} and no checkpoint in this folder")
+        raise NoPolicyError(f"{path}: no {FILE} and no checkpoint in this folder")
     return found
 
 
 def _read(file: Path, spec: RunSpec | None) -> Saved:
+    regular(file, absent=True)
     try:
         state = load_whole(file)
     except FileNotFoundError as error:
-        raise InputError(f"{file}: no such file") from error
-    except Exception as error:  # cut short, or not a checkpoint: zipfile, pickle and torch raise several kinds
-        raise InputError(f"{file}: not a readable checkpoint") from error
+        raise NoPolicyError(f"{file}: no such file") from error
+    except DamagedError as error:  # cut short, or not a checkpoint
+        raise NoPolicyError(f"{file}: not a readable checkpoint") from error
     inner = state.get("trainer", state) if isinstance(state, dict) else {}
     if not isinstance(inner, dict) or "algorithm" not in inner:
         raise InputError(f"{file}: readable, but not a checkpoint of a run")

@@ -145,7 +145,7 @@ class Pool:
             return self._died(key, taken, str(error))
         except RayError as error:
             return Failed(f"{type(error).__name__}: {one_line(error)}", str(error))
-        if "error" in result:
+        if "error" in result and not result.get("diverged"):
             return Failed(result["error"], result["trace"])
         taken.place = result["place"]
         return result | {"points": taken.new(result["points"])}

@@ -1,6 +1,9 @@
 """What a person sees while a study runs: a live line per run on a terminal, plain lines elsewhere."""
 
+import sys
 import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -9,7 +12,10 @@ from typing import Protocol, Self
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.table import Table
+from rich.text import Text
 
+from pipelines.decoration import decoration
+from pipelines.errors import visible
 from rhmc.types import Metrics
 
 EVERY = 10.0  # seconds between two plain lines of a run
@@ -83,6 +89,59 @@ class Board(Protocol):
         ...
 
 
+class SafeBoard:
+    """A board that never ends a launch: what it cannot show is left out, which is said once on stderr.
+
+    Args:
+        make: the board itself.
+    """
+
+    def __init__(self, make: Callable[[], Board]) -> None:
+        self.told = False
+        self.inner: Board | None = None
+        with self._guarded():
+            self.inner = make()
+
+    def __enter__(self) -> Self:
+        self._pass(lambda inner: inner.__enter__())
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._pass(lambda inner: inner.__exit__(kind, error, trace))
+
+    def start(self, name: str, total: int, reached: int = 0) -> None:
+        """See `Board`."""
+        self._pass(lambda inner: inner.start(name, total, reached))
+
+    def points(self, name: str, points: list[Metrics]) -> None:
+        """See `Board`."""
+        self._pass(lambda inner: inner.points(name, points))
+
+    def end(self, name: str, outcome: str) -> None:
+        """See `Board`."""
+        self._pass(lambda inner: inner.end(name, outcome))
+
+    def say(self, text: str) -> None:
+        """See `Board`."""
+        self._pass(lambda inner: inner.say(text))
+
+    def _pass(self, do: Callable[[Board], object]) -> None:
+        if self.inner is not None:
+            inner = self.inner
+            with self._guarded():
+                do(inner)
+
+    def _guarded(self) -> AbstractContextManager[None]:
+        return decoration("progress", self._tell)
+
+    def _tell(self, text: str) -> None:
+        if not self.told:
+            self.told = True
+            print(f"rhmc: {text}", file=sys.stderr)
+
+
 class PlainBoard:
     """Lines for a log file: a run's start and end, and what it did at most every ten seconds."""
 
@@ -120,7 +179,7 @@ class PlainBoard:
 
     def say(self, text: str) -> None:
         """See `Board`."""
-        self.console.print(text, markup=False, highlight=False, soft_wrap=True)
+        self.console.print(visible(text), markup=False, emoji=False, highlight=False, soft_wrap=True)
 
 
 class LiveBoard:
@@ -128,7 +187,8 @@ class LiveBoard:
 
     def __init__(self, console: Console) -> None:
         text = ("{task.fields[steps]}", "{task.fields[rate]}", "{task.fields[score]}", "{task.fields[left]}")
-        columns = [TextColumn("{task.description}"), BarColumn(20), *(TextColumn(t) for t in text)]
+        first, *rest = (TextColumn(t, markup=False) for t in ("{task.description}", *text))
+        columns = [first, BarColumn(20), *rest]
         self.progress = Progress(*columns, console=console, transient=True)
         self.lines: dict[str, tuple[Line, TaskID]] = {}
 
@@ -174,7 +234,7 @@ class LiveBoard:
 
     def say(self, text: str) -> None:
         """See `Board`."""
-        self.progress.console.print(text, markup=False, highlight=False, soft_wrap=True)
+        self.progress.console.print(visible(text), markup=False, emoji=False, highlight=False, soft_wrap=True)
 
 
 class StopFile:
@@ -197,17 +257,17 @@ class StopFile:
 
 
 def board(console: Console) -> Board:
-    """The board that suits where the output goes."""
-    return LiveBoard(console) if console.is_terminal else PlainBoard(console)
+    """The board that suits where the output goes; a `terminal`."""
+    return SafeBoard(lambda: LiveBoard(console) if console.is_terminal else PlainBoard(console))
 
 
 def print_table(console: Console, header: list[str], rows: list[list[str]]) -> None:
-    """A small table; every column but the first is numbers."""
+    """A small table on a `terminal`; every column but the first is numbers."""
     table = Table(box=None, pad_edge=False, padding=(0, 3, 0, 0))
     for place, title in enumerate(header):
-        table.add_column(title, justify="right" if place else "left", no_wrap=True)
+        table.add_column(Text(title), justify="right" if place else "left", no_wrap=True)
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(Text, row))
     if not console.is_terminal:  # nothing to fit into: no column is cut
         wide = console.options.update(max_width=10_000)
         console.width = max(console.width, console.measure(table, options=wide).maximum)

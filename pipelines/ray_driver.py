@@ -2,8 +2,6 @@
 
 import logging
 import os
-import shutil
-import tempfile
 from collections import defaultdict, deque
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -11,77 +9,58 @@ from pathlib import Path
 from typing import Any
 
 import ray
+from pyarrow.fs import LocalFileSystem
 from ray import tune
 from ray.exceptions import RayError
 from ray.tune.experiment import Trial
 from ray.tune.search import Searcher
 
-from pipelines.cluster import DEATHS, Deaths, Place, address, knock, outline, survey, travelling, watched
+from pipelines.cluster import DEATHS, Deaths, Place, address, exposed, knock, outline, survey, travelling, watched
+from pipelines.own_node import allow_files, closed, private_folder, read_again
 from pipelines.progress import StopFile
 from pipelines.ray_settings import OWN_NODE, RAY_SETTINGS, set_up_ray
 from pipelines.recorders import Recorders
 from pipelines.store import StoreError, one_line
 from pipelines.trainable import RunTrainable
 
+HERE = "Ray cannot be used, on this machine"  # how an error begins that Ray met while it started
 QUIET: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.CRITICAL}
 
 
 @contextmanager
-def sockets(name: str) -> Iterator[Path]:
-    """A folder for Ray's sockets, whose paths may hold 107 characters: it cannot lie in the work folder.
-
-    A killed driver leaves it behind, so it has the same name each time and is emptied first.
-
-    Args:
-        name: tells it from those of other drivers that may run now.
-
-    Raises:
-        StoreError: it cannot be made.
-    """
-    folder = Path(tempfile.gettempdir()) / f"ray-{name}"
-    shutil.rmtree(folder, ignore_errors=True)
-    try:
-        folder.mkdir(mode=0o700, exist_ok=True)
-        if folder.stat().st_uid != os.getuid():
-            raise PermissionError(0, "belongs to another user")
-    except OSError as error:
-        raise StoreError(f"{folder}: Ray's folder cannot be made: {error.strerror}") from error
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-@contextmanager
 def ray_session(concurrent: int, cpus: int = 1, name: str = "", home: Path | None = None) -> Iterator[list[str]]:
-    """The cluster at `$RAY_ADDRESS`, or one on this machine for as long as it is needed.
+    """The cluster at `$RAY_ADDRESS`, or one on this machine, closed to all others, for as long as it is needed.
 
     Args:
         concurrent: trainings at a time.
         cpus: processors of each.
-        name: see `sockets`; this process if empty.
+        name: see `private_folder`; this process if empty.
         home: the work folder, which all nodes of a cluster have to share; not looked at if None.
 
     Yields:
         What a person should know of a cluster, line by line.
 
     Raises:
-        StoreError: the cluster cannot be reached or one of its nodes cannot train, or none can be started here.
+        StoreError: the cluster cannot be reached, is open to strangers, or one of its nodes cannot train; or none can
+            be started here.
     """
     if ray.is_initialized():
         yield []
         return
     with _joined(address()) if address() else _started(concurrent * cpus, name):
-        yield [outline(concurrent, cpus), *(survey(home) if home else [])] if address() else []
+        yield [outline(concurrent, cpus), *exposed(), *(survey(home) if home else [])] if address() else []
 
 
 @contextmanager
 def _joined(where: str) -> Iterator[None]:
     knock(where)
-    with _explained(f"the cluster at RAY_ADDRESS={where}"):
+    read_again()
+    with _explained(f"Ray cannot be used, the cluster at RAY_ADDRESS={where}"):
         ray.init(address=where, runtime_env=travelling(RAY_SETTINGS), **QUIET)
     try:
-        with watched(ray.get_runtime_context().gcs_address):
+        head = ray.get_runtime_context().gcs_address
+        knock(head)  # again, for `auto`
+        with watched(head):
             yield
     finally:
         ray.shutdown()
@@ -89,15 +68,16 @@ def _joined(where: str) -> Iterator[None]:
 
 @contextmanager
 def _started(cpus: int, name: str) -> Iterator[None]:
-    with sockets(name or str(os.getpid())) as folder:
-        with _explained("on this machine"):
+    allow_files(cpus)
+    with private_folder(name or str(os.getpid())) as folder, closed():
+        with _explained(HERE):
             set_up_ray(OWN_NODE)
             ray.init(
                 address="local",
                 num_cpus=cpus,
                 include_dashboard=False,
                 object_store_memory=100 * 2**20,
-                _temp_dir=str(folder),
+                _temp_dir=str(folder / "ray"),
                 **QUIET,
             )
         try:
@@ -111,7 +91,7 @@ def _explained(where: str) -> Iterator[None]:
     try:
         yield
     except (ConnectionError, OSError, RuntimeError, ValueError, RayError) as error:
-        raise StoreError(f"Ray cannot be used, {where}: {one_line(error)}") from error
+        raise StoreError(f"{where}: {one_line(error)}") from error
 
 
 def fit(jobs: list[dict[str, Any]], recorder: Recorders, scratch: Path, concurrent: int, cpus: int, stop: Path) -> None:
@@ -130,6 +110,7 @@ def fit(jobs: list[dict[str, Any]], recorder: Recorders, scratch: Path, concurre
         run_config=tune.RunConfig(
             name="trials",
             storage_path=str(scratch),
+            storage_filesystem=LocalFileSystem(),  # the path is one, and no address, whatever characters it has
             verbose=0,
             callbacks=[bridge],
             stop=Halt(bridge),
@@ -237,7 +218,7 @@ class Bridge(tune.Callback):
     def _died(self, key: str, trial: Trial) -> str:
         """Count the death of a worker, and say what Ray wrote of all of them."""
         self.live.discard(key)
-        trace = Path(trial.error_file).read_text() if trial.error_file else ""
+        trace = Path(trial.error_file).read_text(encoding="utf-8", errors="replace") if trial.error_file else ""
         place = self.places.pop(key, None)
         self.deaths[key].add(place.node if place else "", trace.rpartition("Failure #")[2])
         return trace

@@ -16,7 +16,6 @@ RAY_SETTINGS = {
 }
 
 OWN_NODE = {  # of a node that is started for one launch: Ray's defaults suit many short tasks, a training lasts minutes
-    "RAY_AUTH_MODE": "disabled",
     "RAY_memory_monitor_refresh_ms": "2000",
     "RAY_raylet_report_resources_period_milliseconds": "1000",
     "RAY_metrics_report_interval_ms": "60000",

@@ -1,18 +1,18 @@
 """From results of training to the log and the board; knows neither Ray nor MLflow."""
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
+from pipelines.decoration import EPISODE, WHY_NOT, decoration
+from pipelines.litter import scratch
 from pipelines.overview import Overview
 from pipelines.plan import Item, finished, resolved_yaml
 from pipelines.policy import CONFIG, FILE
 from pipelines.progress import Board
-from pipelines.render import EPISODE, WHY_NOT
 from pipelines.store import Checkpoints, Home
-from pipelines.tracker import Recorded, RunLog, Status, StudyCard, Tracker, points_of
+from pipelines.tracker import VALUES_ONLY, Recorded, RunLog, Status, StudyCard, Tracker, points_of
 from rhmc.trainer import grid_step
 from rhmc.types import Metrics
 
@@ -46,7 +46,7 @@ class Recorder:
             if (item.card.arm, item.key) not in done:
                 self.waiting[item.key].append(item)
         self.skipped = len(plan) - self.left
-        self.overview = Overview(study, plan, tracker, recorded)
+        self.overview = Overview(study, plan, tracker, recorded, board.say)
         self.overview.describe()
         self._set_aside(recorded)
         self._tidy()
@@ -91,7 +91,7 @@ class Recorder:
     def _copy(self, source: str, items: list[Item]) -> None:
         points = points_of(self.tracker.rows([source])) if items else []
         for item in items:
-            copy_run(self.tracker, self.study, source, item, points, {"reused_from": source})
+            copy_run(self.tracker, self.study, source, item, points, {"reused_from": source}, self.board.say)
             self.overview.points(item.card.arm, item.key, points)
             self.overview.ended(item.card.arm, item.key, "finished")
             self.board.say(f"{item.name}: the same training was finished before; copied")
@@ -114,15 +114,13 @@ class Recorder:
         return grid_step(item.spec.trainer, points - 1) if points else 0
 
     def result(self, key: str, result: dict[str, Any]) -> None:
-        """New points of a training; the last ones finish its run."""
+        """New points of a training; the last ones finish its run, or tell that it failed."""
+        if points := result["points"]:
+            self._points(key, points)
+        item = self.waiting[key][0]
         if error := result.get("error"):
             self.failed(key, error, result["trace"])
-            return
-        item, points = self.waiting[key][0], result["points"]
-        self.logs[key].log(points)
-        self.board.points(item.name, points)
-        self.overview.points(item.card.arm, key, points)
-        if result["stopped"]:
+        elif result["stopped"]:
             self._end(key, "interrupted")
             if result.get("busy"):
                 self.busy = True
@@ -132,9 +130,15 @@ class Recorder:
         elif result["done"]:
             self._finish(key)
 
+    def _points(self, key: str, points: list[Metrics]) -> None:
+        item = self.waiting[key][0]
+        self.logs[key].log(points)
+        self.board.points(item.name, points)
+        self.overview.points(item.card.arm, key, points)
+
     def _finish(self, key: str) -> None:
         log, items, folder = self.logs[key], self.waiting[key], self.home.checkpoints(key)
-        keep(log, folder)
+        keep(log, folder, items[0].name, self.board.say)
         self._end(key, "finished")
         self.board.end(items[0].name, "finished")
         self._copy(log.ref, items[1:])
@@ -175,27 +179,45 @@ class Recorder:
 
 
 def copy_run(
-    tracker: Tracker, study: StudyCard, source: str, item: Item, points: list[Metrics], tags: Mapping[str, str]
+    tracker: Tracker,
+    study: StudyCard,
+    source: str,
+    item: Item,
+    points: list[Metrics],
+    tags: Mapping[str, str],
+    say: Callable[[str], None],
 ) -> None:
-    """Log a planned run as finished, with the values and files of another one."""
+    """Log a planned run as finished, with the values and files of another one. say: see `keep`."""
     log = tracker.start(item.card)
     log.log(points)
     log.text(CONFIG, resolved_yaml(item, study))
-    with TemporaryDirectory() as folder:
-        for name in EXTRAS:
-            tracker.file(source, name, Path(folder))
-        (Path(folder) / CONFIG).write_text(resolved_yaml(item, study))  # for a policy without its spec
-        if tracker.file(source, FILE, Path(folder)):
-            keep(log, Path(folder))
+    with scratch() as folder:
+        with decoration(f"{item.name}: its animation", say):
+            for name in EXTRAS:
+                tracker.file(source, name, folder)
+        config = resolved_yaml(item, study)  # for a policy without its spec
+        (folder / CONFIG).write_text(config, encoding="utf-8")
+        if tracker.file(source, FILE, folder):
+            keep(log, folder, item.name, say)
+        else:
+            log.tag(VALUES_ONLY, "yes")
     for name, value in tags.items():
         log.tag(name, value)
     log.finish("finished")
 
 
-def keep(log: RunLog, folder: Path) -> None:
-    """Keep what a finished training left in a folder, and offer its policy as a model."""
+def keep(log: RunLog, folder: Path, name: str = "run", say: Callable[[str], None] = lambda _: None) -> None:
+    """Keep what a finished training left in a folder, and offer its policy as a model.
+
+    Args:
+        name: what a person calls the run.
+        say: where it is said that it has no animation.
+    """
     log.artifact(folder / FILE)
-    for name in EXTRAS:
-        if (folder / name).exists():
-            log.artifact(folder / name)
+    with decoration(f"{name}: its animation", say):
+        for extra in EXTRAS:
+            if (folder / extra).exists():
+                log.artifact(folder / extra)
+        if (folder / WHY_NOT).exists():
+            say(f"{name}: no animation ({(folder / WHY_NOT).read_text(encoding='utf-8').strip()})")
     log.model(folder / FILE)

@@ -58,13 +58,13 @@ class Recorders:
 
     def result(self, key: str, result: dict[str, Any]) -> None:
         """New points of a training; finished or failed, it is so for every study that wants it."""
-        if error := result.get("error"):
-            self.failed(key, error, result["trace"])
-            return
         owner, *others = self._waiting(key)
         source = owner.logs[key].ref
         owner.result(key, result)
-        if key not in owner.waiting:
+        if error := result.get("error"):
+            for one in others:
+                one.failed(key, error, result["trace"])
+        elif key not in owner.waiting:
             for one in others:
                 one.adopt(key, source)
 

@@ -2,9 +2,11 @@
 
 import json
 import re
+import urllib.parse
+import urllib.request
 import warnings
+from contextlib import suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,8 @@ from mlflow.models import Model, ModelSignature
 from mlflow.types import ColSpec, Schema, TensorSpec
 from mlflow.utils.mlflow_tags import MLFLOW_MODEL_VERSIONS
 
+from pipelines.litter import remove, scratch
+from pipelines.names import PROFILES, slug
 from pipelines.policy import FILE, Saved, load, save, sizes
 from pipelines.study import RunSpec
 from pipelines.tracker import Card, StudyCard
@@ -27,13 +31,15 @@ with warnings.catch_warnings():  # MLflow's own type hints make it warn
     from mlflow.pyfunc import save_model
 
 CODE = Path(__file__).with_name("served.py")
+_PROFILE = re.compile(rf"-({'|'.join(PROFILES)})(-|\Z)")  # what ends the study in a model's name
 REQUIREMENTS = [f"torch=={torch.__version__.partition('+')[0]}", f"numpy=={np.__version__}"]
 
 
 def model_name(study: StudyCard, arm: str) -> str:
-    """The registered name of an arm: what stands in `models:/<name>/<version>`."""
+    """The registered name of an arm: what stands in `models:/<name>/<version>`. No two arms have the same."""
     words = f"{study.study}-{study.profile}-{arm}"
-    return re.sub(r"[^A-Za-z0-9._+-]+", "-", words).strip("-")
+    told = not _PROFILE.search(study.study)  # else it may be read as another study with another arm
+    return slug(words) if told else slug(words, of=f"{study.study}/{study.profile}/{arm}")
 
 
 def register(client: MlflowClient, run: str, experiment: str, study: StudyCard, card: Card, policy: Path) -> None:
@@ -89,6 +95,8 @@ def _logged(
         if made is None and there.status == LoggedModelStatus.READY:
             made = there
         else:
+            if there.status != LoggedModelStatus.READY:
+                _remove_files(there.artifact_location)
             client.delete_logged_model(there.model_id)
     saved = load(policy)
     if made is None:
@@ -99,12 +107,22 @@ def _logged(
     return made
 
 
+def _remove_files(location: str) -> None:
+    """Remove what a killed launch copied of a model, where files are kept in a folder: MLflow leaves them for good."""
+    address = urllib.parse.urlsplit(location)
+    if address.scheme in ("", "file"):
+        folder = Path(urllib.request.url2pathname(address.path))
+        remove(folder)
+        with suppress(OSError):
+            folder.parent.rmdir()
+
+
 def _written(
     client: MlflowClient, run: str, experiment: str, name: str, tags: dict[str, str], saved: Saved
 ) -> LoggedModel:
     spec = saved.spec
     made = client.create_logged_model(experiment, name, run, tags, model_type="policy")
-    with TemporaryDirectory() as folder:
+    with scratch() as folder:
         local, file = str(Path(folder) / "model"), Path(folder) / FILE
         save(file, saved)
         save_model(

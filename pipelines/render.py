@@ -1,11 +1,8 @@
 """One episode of a policy as a small animation, beside policies without learning and a bound if wanted."""
 
-import os
 import re
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -15,14 +12,14 @@ from pipelines import policy
 from pipelines.animation import Panel, Scene, gif
 from pipelines.document import choices
 from pipelines.errors import InputError
-from pipelines.store import Home, StoreError
+from pipelines.litter import scratch
+from pipelines.store import Home, StoreError, whole
 from rhmc.envs import ENVS, EnvConfig, coverage
 from rhmc.scripted import SCRIPTED
 from rhmc.scripted.coverage import windows
 from rhmc.scripted.joint import best_choice
 
 FRAMES, MILLISECONDS = 40, 110
-EPISODE, WHY_NOT = "episode.gif", "episode.txt"  # what a run keeps: an animation, or why there is none
 RUN = re.compile(r"[0-9a-f]{32}")  # how MLflow names a run
 
 FREE = "free_heading_bound"  # a bound that can be shown: sensors that take any heading at once
@@ -160,7 +157,7 @@ def _saved(what: str, home: Home) -> policy.Saved:
     path = Path(what)
     if path.exists() or not RUN.fullmatch(what):
         return policy.load(path)
-    with TemporaryDirectory() as folder:
+    with scratch() as folder:
         return policy.load(_fetch(what, home, Path(folder)))
 
 
@@ -173,7 +170,7 @@ def _fetch(ref: str, home: Home, folder: Path) -> Path:
     except StoreError as error:
         raise InputError(str(error)) from error
     if policy.FILE not in found:
-        raise InputError(f"run {ref} keeps no {policy.FILE}: it is not finished")
+        raise InputError(f"run {ref} keeps no {policy.FILE}: it is not finished, or the file is gone")
     return folder
 
 
@@ -183,11 +180,5 @@ def write(path: Path, content: bytes) -> None:
     Raises:
         StoreError: the folder cannot be written to, or the disk is full.
     """
-    part = path.with_suffix(f".{os.getpid()}.part")
-    try:
+    with whole(path) as part:
         part.write_bytes(content)
-        part.replace(path)
-    except OSError as error:
-        with suppress(OSError):
-            part.unlink(missing_ok=True)
-        raise StoreError(f"{path}: cannot be written: {error.strerror or error}") from error

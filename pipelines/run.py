@@ -1,28 +1,32 @@
 """Launch studies: what their plans still lack goes through Ray Tune, results go to the log as they come."""
 
 import json
+import os
 import shlex
 import shutil
 import signal
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, NamedTuple, Self
 
-from rich.console import Console
-
-from pipelines.errors import InputError
+from pipelines.addresses import without_password
+from pipelines.errors import InputError, visible
 from pipelines.host import Host, host
-from pipelines.plan import Item, commit, finished, items, study_card
+from pipelines.limits import absent
+from pipelines.origin import another, remember
+from pipelines.plan import Item, finished, given_twice, items, read_commit, study_card
 from pipelines.progress import Board, board, print_table
 from pipelines.ray_settings import set_up_ray
 from pipelines.recorder import Recorder
 from pipelines.recorders import Recorders
-from pipelines.store import Home, StoreError, without_password
+from pipelines.stale import reasons
+from pipelines.store import Home, StoreError
 from pipelines.study import Study
+from pipelines.terminal import terminal
 from pipelines.tracker import Tracker
 
 if TYPE_CHECKING:
@@ -48,18 +52,27 @@ def run_studies(studies: Sequence[Study], home: Path) -> int:
     Raises:
         InputError: the studies cannot be launched together.
     """
-    if faults := list(_apart(studies)):
-        raise InputError("\n".join(faults))
+    devices = {arm.trainer.device: f"{one.name} / {name}" for one in studies for name, arm in one.arms.items()}
+    if faults := [*_apart(studies), *missing_devices(devices.items())]:
+        raise InputError(*faults)
+    for remark in (remark for study in studies for remark in study.remarks):
+        print(f"note: {remark}", file=sys.stderr)
     names = [(study.name, study.profile) for study in studies]
     return guarded(home, names, lambda place, interrupts: _launch(studies, place, interrupts))
+
+
+def missing_devices(where: Iterable[tuple[str, str]]) -> Iterator[str]:
+    """Devices, each with who asks for it, that are not here; what a cluster has is its nodes' business."""
+    if os.environ.get("RAY_ADDRESS", "local") not in ("", "local"):
+        return
+    for device, who in dict(where).items():
+        yield from (f"trainer.device ({who}): {text}" for text in absent([device]))
 
 
 def _apart(studies: Sequence[Study]) -> Iterator[str]:
     """Why studies cannot be launched together."""
     first = studies[0]
-    for name, count in Counter(study.name for study in studies).items():
-        if count > 1:
-            yield f"{name}: given {count} times; studies that run together need names of their own"
+    yield from given_twice(studies)
     for study in studies:
         for field in ("concurrent", "cpus"):
             value, other = getattr(study.resources, field), getattr(first.resources, field)
@@ -158,8 +171,15 @@ class Launched(NamedTuple):
 
 
 def _launch(studies: Sequence[Study], home: Home, interrupts: Interrupts) -> int:
-    with board(Console()) as display, ExitStack() as logs:
-        code = Code(commit(), host())
+    with board(terminal()) as display, ExitStack() as logs:
+        for study in studies:
+            if remark := another(home, study.name, study.profile, study.file):
+                display.say(remark)
+            remember(home, study.name, study.profile, study.file)
+        known = read_commit()
+        if known.why:
+            display.say(f"the commit is logged as unknown: {known.why}")
+        code = Code(known.name, host())
         launched = [logs.enter_context(_logged(study, code, home, display)) for study in studies]
         recorders = Recorders([one.recorder for one in launched])
         if skipped := sum(one.skipped for one in recorders.each):
@@ -184,6 +204,8 @@ def _logged(study: Study, code: Code, home: Home, display: Board) -> Iterator[La
     tracker = MlflowTracker(card, home)
     recorder = None
     try:
+        for remark in tracker.remarks:
+            display.say(f"{study.name}: {remark}")
         recorder = Recorder(card, items(study, *code), tracker, home, display)
         yield Launched(study, tracker, recorder)
     finally:
@@ -244,14 +266,14 @@ def animated(study: Study, plan: list[Item]) -> set[str]:
 
 
 def _summary(launched: Sequence[Launched]) -> None:
-    console = Console()
+    console = terminal()
     console.print()
     several = len(launched) > 1
     rows = [[*[one.study.name][:several], *row] for one in launched for row in _arms(one.recorder.plan, one.tracker)]
     print_table(console, [*["study"][:several], "arm", "finished", "mean return"], rows)
     for one in launched:
         for name, error in one.recorder.failures.items():
-            console.print(f"failed: {name}: {error}", markup=False, highlight=False, soft_wrap=True)
+            console.print(visible(f"failed: {name}: {error}"), soft_wrap=True)
     tracker, left = launched[0].tracker, any(one.recorder.left for one in launched)
     experiments = ", ".join(repr(one.tracker.name) for one in launched)
     lines = [
@@ -260,7 +282,7 @@ def _summary(launched: Sequence[Launched]) -> None:
         f"next:  rhmc {'study run' if left else 'export'} {_arguments([one.study for one in launched])}",
     ]
     lines[-1] += "   (continues)" if left else ""
-    console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+    console.print("\n".join(map(visible, lines)), soft_wrap=True)
 
 
 def _arguments(studies: Sequence[Study]) -> str:
@@ -298,32 +320,45 @@ STATES = ("finished", "running", "interrupted", "failed", "missing")
 
 
 def show_status(study: Study, home: Path, *, as_json: bool = False) -> int:
-    """Print how far a study is: per arm the runs finished, under way, failed, missing, and stale (of other code).
+    """Print how far a study is: per arm the runs finished, under way, failed (and why), missing, and stale (and why).
 
     Returns:
         0 all finished, 1 not, 2 something is in the way.
     """
     try:
-        arms, complete = _status(study, Home(home))
+        found = _status(study, Home(home))
     except StoreError as error:
         print(f"rhmc: {error}", file=sys.stderr)
         return BAD
     if as_json:
-        print(json.dumps({"study": study.name, "profile": study.profile, "finished": complete, "arms": arms}))
+        print(json.dumps({"study": study.name, "profile": study.profile} | found._asdict()))
     else:
         columns = ["planned", *STATES, "stale"]
-        print_table(Console(), ["arm", *columns], [[arm, *(str(one[c]) for c in columns)] for arm, one in arms.items()])
-    return DONE if complete else FAILED
+        rows = [[arm, *(str(one[c]) for c in columns)] for arm, one in found.arms.items()]
+        print_table(terminal(), ["arm", *columns], rows)
+        lines = [f"failed: {name}: {error}" for name, error in found.errors.items()]
+        lines += [*found.stale, *(f"note: {remark}" for remark in study.remarks)]
+        terminal().print("\n".join(map(visible, lines)), soft_wrap=True, end="\n" if lines else "")
+    return DONE if found.finished else FAILED
 
 
-def _status(study: Study, home: Home) -> tuple[dict[str, dict[str, int]], bool]:
+class Standing(NamedTuple):
+    """How far a study is."""
+
+    finished: bool  # all of it
+    arms: dict[str, dict[str, int]]  # runs by state
+    errors: dict[str, str]  # of each failed run, by its name
+    stale: list[str]  # why runs are no part of the plan, a line for each arm and reason
+
+
+def _status(study: Study, home: Home) -> Standing:
     from pipelines.mlflow_tracker import open_existing
 
     tracker = open_existing(study_card(study), home)
     recorded = tracker.recorded() if tracker else []
     plan = items(study)
     # Runs of a driver that was killed are logged as running; a log in this folder knows no other driver than one here.
-    own = tracker is not None and tracker.uri == f"sqlite:///{home.database}"
+    own = tracker is not None and tracker.own
     seen = {"running": "interrupted"} if own and not home.driven(study.name, study.profile) else {}
     state = {(run.arm, run.key): seen.get(run.status, run.status) for run in recorded}
     planned = {(item.card.arm, item.key) for item in plan}
@@ -332,4 +367,7 @@ def _status(study: Study, home: Home) -> tuple[dict[str, dict[str, int]], bool]:
     for arm, places in _by_arm(plan).items():
         mine = Counter(state.get(place, "missing") for place in places)
         arms[arm] = {"planned": len(places)} | {kind: mine[kind] for kind in STATES} | {"stale": stale[arm]}
-    return arms, planned <= finished(recorded)
+    failed = {(run.arm, run.key): run.error for run in recorded if run.status == "failed"}
+    errors = {item.name: failed[item.card.arm, item.key] for item in plan if (item.card.arm, item.key) in failed}
+    why = reasons(plan, recorded, tracker) if tracker else []
+    return Standing(planned <= finished(recorded), arms, errors, why)

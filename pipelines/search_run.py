@@ -9,25 +9,29 @@ import math
 import shlex
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
-from rich.console import Console
 from ruamel.yaml import YAML
 
-from pipelines.found import file_name, slug, winner_yaml, write_text
-from pipelines.identity import fingerprint
-from pipelines.plan import commit
+from pipelines.addresses import without_password
+from pipelines.decoration import decoration
+from pipelines.errors import InputError, visible
+from pipelines.found import file_name, stem, winner_yaml, write_text
+from pipelines.origin import another, remember
+from pipelines.plan import read_commit
 from pipelines.progress import Board, StopFile, board, print_table
 from pipelines.ray_settings import set_up_ray
-from pipelines.run import BAD, DONE, FAILED, Interrupts, guarded
+from pipelines.run import BAD, DONE, FAILED, Interrupts, guarded, missing_devices
 from pipelines.search import Search
-from pipelines.store import Checkpoints, Home, StoreError, without_password
+from pipelines.store import Checkpoints, Home, StoreError
+from pipelines.terminal import terminal
 from pipelines.tracker import Card, RunLog, Status, StudyCard, Tracker
 from pipelines.trials import OBJECTIVE, Asked, BaseStorage, Ledger, explained, look, opened, storage_url
+from reports.escape import markdown, prose
 from rhmc.types import Metrics
 
 if TYPE_CHECKING:
@@ -70,6 +74,11 @@ def run_search(search: Search, home: Path, out: Path | None = None) -> int:
             assert storage is not None
             return _launch(search, place, storage, out or found_folder(search, place), interrupts)
 
+    devices = {arm.setting.trainer.device: name for name, arm in search.arms.items()}
+    if faults := list(missing_devices(devices.items())):
+        raise InputError(*faults)
+    for remark in search.remarks:
+        print(f"note: {remark}", file=sys.stderr)
     return guarded(home, [(search.name, search.profile)], launch)
 
 
@@ -86,27 +95,39 @@ def plots_folder(search: Search, home: Home) -> Path:
 def _launch(search: Search, home: Home, storage: BaseStorage, out: Path, interrupts: Interrupts) -> int:
     from pipelines.mlflow_tracker import MlflowTracker  # 3 s: only when something is launched
 
-    code, url = fingerprint(), storage_url(home)
+    url = storage_url(home)
     tracker = MlflowTracker(search_card(search), home)
     status: Status = "interrupted"
     try:
-        with explained(url), board(Console()) as display:
-            ledgers = [Ledger(search, arm, code, storage) for arm in search.arms]
+        with explained(url), board(terminal()) as display:
+            if remark := another(home, search.name, search.profile, search.file):
+                display.say(remark)
+            remember(home, search.name, search.profile, search.file)
+            for remark in tracker.remarks:
+                display.say(remark)
+            ledgers = [Ledger(search, arm, storage) for arm in search.arms]
             for ledger in ledgers:
                 again = ledger.take_up()
+                _clear(search, ledger, home)
                 display.say(f"{ledger.arm}: {ledger.closed} of {search.trials} trials are done, {again} are taken up")
             if any(ledger.left for ledger in ledgers):
-                _train(search, ledgers, Book(search, code, tracker, display), home, interrupts)
+                _train(search, ledgers, Book(search, tracker, display), home, interrupts)
             whole = not any(ledger.left or ledger.live for ledger in ledgers)
             for ledger in ledgers if not whole else []:
                 ledger.take_up()
-            written = results(search, ledgers, code, tracker, home, out if whole else None)
+            written = results(search, ledgers, tracker, home, out if whole else None, display.say)
         failed = any(ledger.counts()["failed"] for ledger in ledgers)
         status = "interrupted" if not whole else "failed" if failed else "finished"
     finally:
         tracker.close(status)
     _summary(search, ledgers, tracker, written, whole)
     return {"finished": DONE, "failed": FAILED}.get(status, interrupts.code)
+
+
+def _clear(search: Search, ledger: Ledger, home: Home) -> None:
+    """Remove what a launch left that was killed between closing a trial and removing its checkpoints."""
+    for asked in ledger.over():
+        Checkpoints(home.checkpoints(trial_card(search, asked, "").key)).clear_unused()
 
 
 def _train(search: Search, ledgers: Sequence[Ledger], book: "Book", home: Home, interrupts: Interrupts) -> None:
@@ -202,12 +223,10 @@ class Drive:
         if "died" in result:
             self.book.died(one.asked)
             return
-        why = self._points(key, one, result["points"])
-        if why:
-            self._end(key)
-            self.book.prune(key, one.asked, why)
-            one.ledger.prune(one.asked, why)
-            Checkpoints(one.folder).clear()
+        if why := self._points(key, one, result["points"]):
+            self._give_up(key, one, why)
+        elif result.get("diverged"):  # a result of these values: tried again, it would be the same
+            self._give_up(key, one, result["error"], "failed")
         elif result["stopped"]:
             self._end(key)
             self.book.interrupt(key, one.asked)
@@ -216,6 +235,13 @@ class Drive:
             self._complete(key, one, result["points"][-1])
         else:
             self.pool.go_on(key)
+
+    def _give_up(self, key: str, one: Running, why: str, status: Status = "finished") -> None:
+        """Prune a trial; `status` is that of its log."""
+        self._end(key)
+        self.book.prune(key, one.asked, why, status)
+        one.ledger.prune(one.asked, why)
+        Checkpoints(one.folder).clear()
 
     def _points(self, key: str, one: Running, points: Sequence[Metrics]) -> str:
         """Take in points one by one, so that a trial that continues with many is given up where it would have been.
@@ -250,19 +276,20 @@ class Book:
 
     Args:
         search: whose.
-        code: fingerprint.
         tracker: the log.
         display: the board.
     """
 
-    def __init__(self, search: Search, code: str, tracker: Tracker, display: Board) -> None:
-        self.search, self.code, self.tracker, self.board = search, code, tracker, display
-        self.commit = commit()
+    def __init__(self, search: Search, tracker: Tracker, display: Board) -> None:
+        self.search, self.tracker, self.board = search, tracker, display
+        self.commit, why = read_commit()
+        if why:
+            display.say(f"the commit is logged as unknown: {why}")
         self.logs: dict[str, RunLog] = {}
 
     def start(self, asked: Asked) -> str:
         """A trial begins or continues; returns its key, which names it in the log and in the checkpoints."""
-        card = trial_card(self.search, asked, self.code, self.commit)
+        card = trial_card(self.search, asked, self.commit)
         log = self.logs[card.key] = self.tracker.start(card)
         log.tag("trial", str(asked.place))
         log.text("config.yaml", self._yaml(asked, card))
@@ -271,7 +298,7 @@ class Book:
 
     def _yaml(self, asked: Asked, card: Card) -> str:
         head = {"search": self.search.name, "profile": self.search.profile, "arm": asked.arm, "trial": asked.place}
-        names = {"fingerprint": self.code, "commit": card.commit, "seeds": self.search.seed_list()}
+        names = {"fingerprint": card.fingerprint, "commit": card.commit, "seeds": self.search.seed_list()}
         out = StringIO()
         YAML().dump(head | names | asked.setting.model_dump(mode="json"), out)
         return out.getvalue()
@@ -286,9 +313,11 @@ class Book:
         self.logs[key].log([{"step": step, "objective": value}])
         self._end(key, asked, "complete", "finished", f"objective {value:.2f}")
 
-    def prune(self, key: str, asked: Asked, why: str) -> None:
+    def prune(self, key: str, asked: Asked, why: str, status: Status) -> None:
         """A trial is given up."""
-        self._end(key, asked, "pruned", "finished", f"pruned, {why}")
+        if status == "failed":
+            self.logs[key].tag("error", why)
+        self._end(key, asked, "pruned", status, f"pruned, {why}")
 
     def interrupt(self, key: str, asked: Asked) -> None:
         """A trial saved itself for the next launch."""
@@ -314,24 +343,24 @@ class Book:
         return f"{self.search.name} / {asked.name}"
 
 
-def trial_card(search: Search, asked: Asked, code: str, commit: str) -> Card:
+def trial_card(search: Search, asked: Asked, commit: str) -> Card:
     """A trial as its log shows it. Two trials with the same values are two runs."""
-    parts = (asked.setting.canonical(), str(search.seed_list()), str(asked.place), search.identity(asked.arm, code))
+    parts = (asked.setting.stated(), str(search.seed_list()), str(asked.place), search.identity(asked.arm))
     spec_id = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:12]
     kinds = asked.setting.algo.kind, asked.setting.env.kind
     params = {"method": kinds[0]} | {f"algo.{name}": str(value) for name, value in asked.params.items()}
-    return Card(asked.arm, search.seed_list()[0], spec_id, code, *kinds, commit, params, asked.place)
+    return Card(asked.arm, search.seed_list()[0], spec_id, search.code(asked.arm), *kinds, commit, params, asked.place)
 
 
 def search_card(search: Search) -> StudyCard:
     """The search as its experiment shows it."""
     seeds = search.seed_list()
     spaces = [
-        f"- {name}: " + ", ".join(f"`{key}` {one}" for key, one in arm.space.items())
+        f"- {markdown(name)}: " + ", ".join(f"`{key}` {markdown(str(one))}" for key, one in arm.space.items())
         for name, arm in search.arms.items()
     ]
     note = (
-        f"{search.question}\n\n"
+        f"{prose(search.question)}\n\n"
         f"Search, profile `{search.profile}`: every arm has {search.trials} trials of {len(seeds)} seeds "
         f"({seeds[0]} to {seeds[-1]}) and {search.steps:,} environment steps each. Sampler {search.sampler.kind}, "
         f"pruner {search.pruner.kind}.\n\n" + "\n".join(spaces) + "\n\nA run is a trial: its curve is the mean over "
@@ -352,29 +381,39 @@ class Written(NamedTuple):
 
 
 def results(
-    search: Search, ledgers: Sequence[Ledger], code: str, tracker: Tracker, home: Home, out: Path | None
+    search: Search,
+    ledgers: Sequence[Ledger],
+    tracker: Tracker,
+    home: Home,
+    out: Path | None,
+    say: Callable[[str], None] = lambda _: None,
 ) -> Written:
-    """Write the plots, and the winners once the budget is spent (`out` is given); keep all of them with the log."""
-    from pipelines.search_plots import plots
+    """Write the plots, and the winners once the budget is spent (`out` is given); keep all of them with the log.
 
+    A plot that cannot be drawn, or not be shown in the log, is left out, and that is said.
+    """
     written = Written([], [])
     for ledger in ledgers:
         title = f"{search.name} ({search.profile}): {ledger.arm}"
-        written.plots.extend(plots(ledger.study, title, plots_folder(search, home) / slug(ledger.arm)))
+        with decoration(f"{ledger.arm}: plots", say):
+            from pipelines.search_plots import plots
+
+            written.plots.extend(plots(ledger.study, title, plots_folder(search, home) / stem(ledger.arm)))
         best = ledger.best()
         if out is not None and best is not None:
             file = out / file_name(search, ledger.arm)
-            write_text(file, winner_yaml(search, ledger.arm, best, ledger.counts(), code))
+            write_text(file, winner_yaml(search, ledger.arm, best, ledger.counts()))
             written.winners.append(file)
     files = (*written.plots, *written.winners)
-    tracker.publish(search_card(search).note, {file.name: file.read_bytes() for file in files})
+    with decoration(f"{search.name}: overview in the log", say):
+        tracker.publish(search_card(search).note, {file.name: file.read_bytes() for file in files})
     return written
 
 
 def _summary(
     search: Search, ledgers: Sequence[Ledger], tracker: "MlflowTracker", written: Written, whole: bool
 ) -> None:
-    console = Console()
+    console = terminal()
     console.print()
     print_table(console, HEADER, [_row(ledger) for ledger in ledgers])
     lines = [_best_line(ledger) for ledger in ledgers]
@@ -384,7 +423,7 @@ def _summary(
     changes = [word for text in search.overrides for word in ("--set", text)]
     again = shlex.join([search.file, "--profile", search.profile, *changes])
     lines += [] if whole else [f"next:   rhmc search run {again}   (continues)"]
-    console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+    console.print("\n".join(map(visible, lines)), soft_wrap=True)
 
 
 HEADER = ["arm", "trials", "complete", "pruned", "running", "waiting", "failed", "missing", "best"]
@@ -414,14 +453,14 @@ def show_search(search: Search, home: Path) -> int:
     Returns:
         0 every trial is closed, 1 not, 2 something is in the way.
     """
-    place, code = Home(home), fingerprint()
+    place = Home(home)
     try:
         with opened(place, write=False) as storage, explained(storage_url(place)):
             if storage is None:
                 print(f"{search.name} ({search.profile}): nothing has been tried yet")
                 return FAILED
-            found = [look(search, arm, code, storage) for arm in search.arms]
-            print_table(Console(), [*HEADER, "stale"], [[*_row(ledger), str(stale)] for ledger, stale in found])
+            found = [look(search, arm, storage) for arm in search.arms]
+            print_table(terminal(), [*HEADER, "stale"], [[*_row(ledger), str(stale)] for ledger, stale in found])
             print("\n".join(_best_line(ledger) for ledger, _ in found))
             return DONE if all(ledger.closed >= search.trials for ledger, _ in found) else FAILED
     except StoreError as error:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Self
 
+from pipelines.health import defined
 from pipelines.study import Setting
 from rhmc.trainer import Trainer
 from rhmc.types import Metrics, State
@@ -38,7 +39,7 @@ class Seeds:
         return self
 
     def __next__(self) -> Metrics:
-        points = {seed: next(trainer) for seed, trainer in self.trainers.items()}
+        points = {seed: defined(next(trainer)) for seed, trainer in self.trainers.items()}
         names = {name: None for point in points.values() for name in point}
         means = {}
         for name in names:

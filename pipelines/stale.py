@@ -2,10 +2,9 @@
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from pipelines.errors import InputError
+from pipelines.litter import scratch
 from pipelines.plan import Item, flatten
 from pipelines.policy import CONFIG, settings
 from pipelines.study import RunSpec
@@ -62,8 +61,8 @@ def _some(words: Sequence[str]) -> str:
 
 def kept_settings(run: Recorded, tracker: Tracker) -> RunSpec | None:
     """The settings that a run kept, None where they cannot be read."""
-    with TemporaryDirectory() as folder:
-        file = tracker.file(run.ref, CONFIG, Path(folder))
+    with scratch() as folder:
+        file = tracker.file(run.ref, CONFIG, folder)
         try:
             return settings(file)[0] if file else None
         except InputError:

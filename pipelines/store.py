@@ -1,33 +1,56 @@
 """The work folder: where it is, who may write to a study, and checkpoints that survive a killed process."""
 
+import errno
+import fcntl
 import hashlib
 import os
 import shutil
 import socket
-import urllib.parse
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
 from filelock import BaseFileLock, FileLock, Timeout
 
+from pipelines.addresses import scrubbed
 from pipelines.errors import InputError
+from pipelines.litter import part_of, remove
 from rhmc.types import State
 
 GLANCE = 0.5  # seconds that another process may hold a study's lock only to see whether it is free
-KEEP = 2  # checkpoints kept: should the newest be damaged, the one before is used
+KEEP = 2  # checkpoints kept: should the newest be damaged, the one before is used; and as many damaged ones
+DAMAGED = ".damaged"  # after the name of a checkpoint that was set aside
+OUT_OF_IT = errno.EINVAL  # what seeking to before the start of a file gives
 
 
 class StoreError(InputError):
-    """Something outside the program is in the way; str() is the whole message, one line."""
+    """Something outside the program is in the way; str() is the whole message, one line, without passwords."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(scrubbed(text))
+
+
+class DamagedError(StoreError):
+    """A file's own content proves that it is not what was written."""
 
 
 def work_folder() -> Path:
-    """`$RHMC_HOME`, or `work` in the current folder."""
-    return Path(os.environ.get("RHMC_HOME") or "work").resolve()
+    """`$RHMC_HOME`, with `~` as a shell understands it, or `work` in the current folder.
+
+    Raises:
+        StoreError: it is no path that the files of a database can have.
+    """
+    name = os.path.expanduser(os.environ.get("RHMC_HOME") or "work")
+    try:
+        name.encode()
+        return Path(name).resolve()
+    except UnicodeEncodeError as error:
+        raise StoreError(f"RHMC_HOME={name!a}: not in UTF-8; name another folder") from error
+    except (OSError, RuntimeError) as error:  # links that lead to themselves
+        raise StoreError(f"RHMC_HOME={name}: {reason(error)}; name another folder") from error
 
 
 class Home:
@@ -61,9 +84,10 @@ class Home:
         Raises:
             StoreError: it cannot.
         """
-        probe = self.root / f".probe-{os.getpid()}"
+        probe = self.root / ".probe"
         try:
             self.root.mkdir(parents=True, exist_ok=True)
+            probe = part_of(probe)
             probe.write_bytes(b"x" * 4096)
             probe.unlink()
         except OSError as error:
@@ -85,23 +109,23 @@ class Home:
         try:
             lock.acquire(timeout=GLANCE)
         except Timeout as error:
-            pid = owner.read_text().strip() if owner.exists() else "unknown"
+            pid = owner.read_text(encoding="utf-8").strip() if owner.exists() else "unknown"
             message = f"{study} ({profile}) is already being run by process {pid} ({path}); wait for it or stop it"
             raise StoreError(message) from error
         try:
-            owner.write_text(f"{os.getpid()} on {socket.gethostname()}\n")
+            owner.write_text(f"{os.getpid()} on {socket.gethostname()}\n", encoding="utf-8")
             yield
         finally:
             lock.release()
 
     def driven(self, study: str, profile: str) -> bool:
         """Whether a process drives the study and profile in this folder."""
-        path = self._lock_file(study, profile)
-        if not path.exists():
-            return False
-        with suppress(Timeout), FileLock(path).acquire(timeout=0):
-            return False
-        return True
+        with suppress(FileNotFoundError), self._lock_file(study, profile).open("rb") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # let go as the file is closed
+            except BlockingIOError:
+                return True
+        return False
 
     def _lock_file(self, study: str, profile: str) -> Path:
         return self.root / "locks" / f"{study}-{profile}.lock"
@@ -124,17 +148,28 @@ class Checkpoints:
             old.unlink(missing_ok=True)
 
     def newest(self) -> State | None:
-        """The newest checkpoint that is whole, or None. Damaged ones are removed, and what a killed writer left."""
+        """The newest checkpoint that is whole, or None. Damaged ones are set aside; what a killed writer left goes.
+
+        Raises:
+            StoreError: one cannot be read, and nothing says that it is damaged. It stays where it is.
+        """
         for part in self.folder.glob("*.part"):
             part.unlink(missing_ok=True)
         for file in self._files():
             try:
                 return load_whole(file)
-            except MemoryError:
-                raise
-            except Exception:  # zipfile, pickle and torch each raise several kinds
-                file.unlink(missing_ok=True)
+            except DamagedError:
+                self._set_aside(file)
         return None
+
+    def _set_aside(self, file: Path) -> None:
+        """Keep the last damaged ones, under a name that no checkpoint has, until the run is finished."""
+        try:
+            file.replace(f"{file}{DAMAGED}")
+            for old in sorted(self.folder.glob(f"*{DAMAGED}"), reverse=True)[KEEP:]:
+                old.unlink(missing_ok=True)
+        except OSError as error:
+            raise StoreError(f"{file}: damaged, and cannot be renamed: {reason(error)}") from error
 
     def points(self) -> int:
         """Points of the grid that the newest checkpoint has behind it, 0 without one. It may not be readable."""
@@ -170,7 +205,10 @@ def whole(path: Path, *, durable: bool = False) -> Iterator[Path]:
     Raises:
         StoreError: the disk is full or the folder closed; nothing half-written is left.
     """
-    part = path.with_name(f"{path.name}.{socket.gethostname()}-{os.getpid()}.part")
+    try:
+        part = part_of(path)
+    except OSError as error:
+        raise StoreError(f"{path}: cannot be written: {reason(error)}") from error
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield part
@@ -179,8 +217,7 @@ def whole(path: Path, *, durable: bool = False) -> Iterator[Path]:
         else:
             part.replace(path)
     except BaseException as error:
-        with suppress(OSError):
-            shutil.rmtree(part) if part.is_dir() else part.unlink(missing_ok=True)
+        remove(part)
         if isinstance(error, OSError | RuntimeError):  # torch reports a failed write as RuntimeError
             raise StoreError(f"{path}: cannot be written: {reason(error)}") from error
         raise
@@ -197,15 +234,63 @@ def save_atomically(path: Path, state: Any) -> None:
 
 
 def load_whole(path: Path) -> Any:
-    """What `save_atomically` wrote, or an exception of any kind.
+    """What `save_atomically` wrote.
 
     `torch.load` alone does not see bytes that changed inside a tensor, such as a block that a power cut left as zeros;
     the checksums that `torch.save` writes beside each tensor do.
+
+    Raises:
+        DamagedError: cut short, a checksum that does not match, no archive at all.
+        StoreError: it cannot be read now (memory, descriptors, rights, the disk), or not by this version.
+        FileNotFoundError: there is none.
     """
-    with zipfile.ZipFile(path) as archive:
-        if damaged := archive.testzip():
-            raise zipfile.BadZipFile(f"{path}: {damaged} does not match its checksum")
-    return torch.load(path, weights_only=True, map_location="cpu")
+    try:
+        with path.open("rb") as file:
+            _check_sums(file)
+            file.seek(0)
+            return torch.load(file, weights_only=True, map_location="cpu")
+    except DamagedError as error:
+        raise DamagedError(f"{path}: damaged: {error}") from error
+    except FileNotFoundError:
+        raise
+    except (OSError, MemoryError) as error:
+        raise StoreError(f"{path}: cannot be read now: {reason(error)}; the file is left as it is") from error
+    except Exception as error:  # its sums are right, so these are words of torch's about something else
+        raise _not_loaded(path, error) from error
+
+
+def _check_sums(file: BinaryIO) -> None:
+    """Read an archive from end to end.
+
+    Raises:
+        DamagedError: it is none, or not the one that was written.
+        OSError, MemoryError: it could not be read.
+    """
+    try:
+        with zipfile.ZipFile(file) as archive:
+            damaged = archive.testzip()
+    except Exception as error:  # zipfile meets what nobody wrote in many ways: bad offsets, flags, methods, names
+        for inner in _chain(error):  # it calls a file that cannot be read no archive
+            if isinstance(inner, MemoryError) or (isinstance(inner, OSError) and inner.errno not in (None, OUT_OF_IT)):
+                raise inner from None
+        raise DamagedError(one_line(error)) from error
+    if damaged:
+        raise DamagedError(f"{damaged} does not match its checksum")
+
+
+def _not_loaded(path: Path, error: Exception) -> StoreError:
+    text = one_line(error)
+    if lacks_memory(error):
+        return StoreError(f"{path}: cannot be read now: not enough memory; the file is left as it is")
+    if isinstance(error, RuntimeError) and "PytorchStreamReader failed" in text:  # names and offsets have no checksum
+        return DamagedError(f"{path}: damaged: {text}")
+    return StoreError(f"{path}: whole, and not readable by this version ({text}); the file is left as it is")
+
+
+def lacks_memory(error: BaseException) -> bool:
+    """Whether there was not enough memory, which torch says by a `RuntimeError`."""
+    words = ("can't allocate memory", "not enough memory", "out of memory", "allocation failed")
+    return isinstance(error, MemoryError) or any(word in str(error).lower() for word in words)
 
 
 def replace_durably(part: Path, path: Path) -> None:
@@ -245,15 +330,6 @@ KEPT: dict[frozenset[str], Callable[[], State]] = {  # what learning keeps, by i
 }
 
 
-def without_password(uri: str) -> str:
-    """An address as it may be shown."""
-    try:
-        password = urllib.parse.urlsplit(uri).password
-    except ValueError:  # brackets that hold no address
-        return uri
-    return uri.replace(f":{password}@", ":***@", 1) if password else uri
-
-
 def one_line(error: BaseException) -> str:
     """The first telling line of an error; of a traceback, which some libraries wrap as it is, the last."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
@@ -264,9 +340,15 @@ def one_line(error: BaseException) -> str:
 
 def reason(error: BaseException) -> str:
     """What the system said, where a library wrapped it in words of its own."""
-    inner: BaseException | None = error
-    while inner is not None:
+    for inner in _chain(error):
         if isinstance(inner, OSError) and inner.strerror:
             return inner.strerror
+    return "not enough memory" if lacks_memory(error) else one_line(error)
+
+
+def _chain(error: BaseException) -> Iterator[BaseException]:
+    """An error and those that it came of."""
+    inner: BaseException | None = error
+    while inner is not None:
+        yield inner
         inner = inner.__cause__ or inner.__context__
-    return one_line(error)

@@ -17,16 +17,17 @@ from typing import Annotated, Any, Generic, Literal, NamedTuple, Self, TypeVar
 
 from pydantic import BaseModel, Field, SerializeAsAny, ValidationInfo, field_validator
 
+from pipelines import limits
 from pipelines.document import Fault, Node, Place, Unreadable, choices, join, merge, override, read, show, validate
-from pipelines.errors import InputError
-from pipelines.grid import Point, nested, points, replaced
+from pipelines.errors import InputError, seen
+from pipelines.grid import MOST, Point, nested, points, replaced
 from pipelines.include import included
+from pipelines.names import ARM, PROFILES, alike, fault_of_study, simple, study_name, too_long
 from rhmc import trainer
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import ENVS, EnvConfig
 from rhmc.types import Frozen
 
-PROFILES = ("quick", "paper")
 SECTIONS = ("env", "algo", "trainer")
 COUNTS = ("seeds", "steps")  # fields of a study that hold a number for each profile
 TABLES: dict[str, dict[str, type[Any]]] = {  # the configuration of every kind
@@ -34,6 +35,7 @@ TABLES: dict[str, dict[str, type[Any]]] = {  # the configuration of every kind
     "algo": {kind: method.config for kind, method in ALGORITHMS.items()},
 }
 NAMED = 3  # arms that a fault names
+VARIANTS = 100  # of a study
 TWIN = "is the same as arm"
 M = TypeVar("M", bound=BaseModel)
 FIELDS = [  # every dotted name of a run's settings
@@ -49,7 +51,7 @@ class StudyError(InputError):
 
     def __init__(self, faults: Sequence[Fault]) -> None:
         self.faults = sorted(set(faults), key=lambda f: (f.place.source.startswith("--set"), *f))
-        super().__init__("\n".join(str(fault) for fault in self.faults))
+        super().__init__(*map(str, self.faults))
 
 
 class Setting(Frozen):
@@ -131,6 +133,7 @@ class Study(Frozen):
     file: str = ""  # as given, for commands that a person can repeat
     overrides: tuple[str, ...] = ()
     variant: str = ""
+    remarks: tuple[str, ...] = ()  # what is allowed and gives nothing: arms whose budget ends before they learn
 
     @classmethod
     def load(
@@ -157,7 +160,8 @@ class Study(Frozen):
         resolved = {name: getattr(getattr(file, name), profile) for name in COUNTS}
         fixed = {"question": file.question.strip(), "resources": file.resources, "profile": profile}
         fixed |= {"file": str(path), "overrides": tuple(overrides), "variant": variant or ""}
-        name = Path(path).stem + (f"@{variant}" if variant else "")
+        name = study_name(Path(path), variant or "")
+        fixed["remarks"] = tuple(map(str, dict.fromkeys(wanted.remarks)))
         return cls(name=name, base=wanted.base, arms=wanted.arms, **fixed, **resolved)
 
     def runs(self) -> list[PlannedRun]:
@@ -262,6 +266,7 @@ class Resolved(NamedTuple):
     base: Setting | None
     arms: dict[str, Setting]
     faults: list[Fault]
+    remarks: Sequence[Fault] = ()
 
 
 class Loaded(NamedTuple, Generic[M]):
@@ -303,7 +308,7 @@ def load_layers(
     known = root._replace(value={key: child for key, child in root.children.items() if key in model.model_fields})
     variants = _group(known, "variants")
     settings = {(p, v): _settings(known, p, v, patches) for p in PROFILES for v in (None, *variants)}
-    faults += structure + _variant_faults(variants, variant)
+    faults += structure + _variant_faults(path, variants, variant)
     # An arm that is wrong in its shape resolves to the base: that it is the same as another is no news then.
     faults += [f for one in settings.values() for f in one.faults if not (structure and TWIN in f.text)]
     if file is not None and profile in PROFILES:
@@ -324,8 +329,10 @@ def _trees(
     faults += found
     if root is None or not isinstance(root.value, dict):
         raise StudyError(faults or [_no_mapping(path, root, model)])
-    if not _plain(path.stem):
-        faults.append(Fault(Place(str(path)), "", "a study's file is named with letters, digits, '-' and '_' only"))
+    if fault := fault_of_study(study_name(path)):
+        faults.append(Fault(Place(str(path)), "", fault))
+    if crowded := _crowded(root):
+        raise StudyError([*faults, *crowded])
     patches, found = _patches(root, overrides)
     whole = [included(tree, path.parent, SECTIONS) for tree in (root, *patches)]
     faults += found + [fault for _, more in whole for fault in more]
@@ -421,7 +428,17 @@ def _settings(root: Node, profile: str, variant: str | None, patches: Sequence[N
     faults += [f if f.path.startswith(plain) else _owned(f, names) for f, names in owners.items()]
     kept, found = _kept(root, chosen)
     arms = {name: arm for name, arm in arms.items() if kept is None or planned[name][0] in kept}
-    return Resolved(base, arms, faults + found)
+    return Resolved(base, arms, faults + found, _unlearned(arms, steps) if steps else [])
+
+
+def _unlearned(arms: Mapping[str, Setting], steps: Node) -> list[Fault]:
+    """Arms whose budget ends before they learn, at its place."""
+    from pipelines.budget import shortfall  # which knows settings
+
+    owners: dict[str, list[str]] = {}
+    for name, setting in arms.items():
+        owners.setdefault(shortfall(setting), []).append(name)
+    return [_owned(Fault(steps.place, steps.path, text), names) for text, names in owners.items() if text]
 
 
 def _planned(
@@ -431,7 +448,10 @@ def _planned(
     arms, faults = _changed(_group(root, "arms"), profile, patches)
     grid, found = replaced(_child(root, "grid"), _child(profile, "grid"))
     combined, more = points(grid, FIELDS, len(arms))
-    return _crossed(arms, combined), faults + found + more
+    crossed = _crossed(arms, combined)
+    more += _alike_faults("arm", {name: arm for name, (_, arm) in crossed.items()})
+    more += [_long_name(name, arm) for name, (_, arm) in crossed.items() if len(name) > ARM]
+    return crossed, faults + found + more
 
 
 def _changed(
@@ -487,7 +507,7 @@ def _setting(layers: Sequence[Node], steps: Node | None) -> tuple[Setting | None
 
 def _misfit(setting: Setting, layers: Sequence[Node]) -> list[Fault]:
     """A method that cannot act in its task, at the place of the task's field that it cannot do with."""
-    text = trainer.misfit(setting.env, setting.algo)
+    text = trainer.misfit(setting.env, setting.algo) or limits.misfit(setting.env, setting.algo)
     if not text:
         return []
     field, _, fault = text.partition(": ")
@@ -523,7 +543,7 @@ def _trainer(node: Node, steps: Node | None) -> tuple[BaseModel | None, list[Fau
         written = children.pop("steps")
         text = "a study's budget is the same for every run; write it as 'steps' at the top of the file"
         faults.append(Fault(written.key, written.path, text))
-    if steps and isinstance(steps.value, int) and steps.value >= 1:
+    if steps and isinstance(steps.value, int) and 1 <= steps.value <= limits.BOUNDS["steps"]:
         children["steps"] = steps
     config, found = validate(trainer.Config, node._replace(value=children), hidden=("steps",))
     return config, faults + found
@@ -540,14 +560,44 @@ def _no_profile(profile: str) -> Fault:
     return Fault(Place("--profile"), "", f"{show(profile)} is not allowed; {choices(profile, PROFILES)}")
 
 
-def _plain(name: str) -> bool:
-    """Whether a name may be part of a file's."""
-    return name.replace("_", "").replace("-", "").isalnum()
+def _crowded(root: Node) -> list[Fault]:
+    """More arms or variants than a study can be resolved with in reasonable time."""
+    most = {"arms": MOST, "variants": VARIANTS}
+    found = {key: len(node.children) for key, node in root.children.items() if key in most}
+    where = root.children
+    return [
+        Fault(where[key].key, key, f"{count:,} of them; at most {most[key]:,}")
+        for key, count in found.items()
+        if count > most[key]
+    ]
 
 
-def _variant_faults(variants: Mapping[str, Node], wanted: str | None) -> list[Fault]:
+def study_fault(name: str) -> str:
+    """What is wrong with the name of a study (of a variant: `stem@variant`), or nothing; it becomes part of paths."""
+    stem, at, variant = name.partition("@")
+    fault = fault_of_study(stem) or too_long(name)
+    return fault or ("a variant is named with letters, digits, '-' and '_' only" if at and not simple(variant) else "")
+
+
+def arm_fault(name: str) -> str:
+    """What is wrong with the name of an arm, or nothing."""
+    if not all(map(seen, name)):
+        return f"{show(name)} is no name for an arm; it has characters that cannot be seen"
+    arm = Node(None, Place(""), Place(""), "")
+    found = _name_faults(name, arm) or ([_long_name(name, arm)] if len(name) > ARM else [])
+    return found[0].text if found else ""
+
+
+def _variant_faults(path: Path, variants: Mapping[str, Node], wanted: str | None) -> list[Fault]:
     text = "a variant is named with letters, digits, '-' and '_' only"
-    faults = [Fault(node.key, node.path, text) for name, node in variants.items() if not _plain(name)]
+    faults = [Fault(node.key, node.path, text) for name, node in variants.items() if not simple(name)]
+    longest = {name: too_long(study_name(path, name)) for name in variants}
+    faults += [
+        Fault(variants[name].key, variants[name].path, f"with the study's, {fault}")
+        for name, fault in longest.items()
+        if fault
+    ]
+    faults += _alike_faults("variant", variants)
     if wanted is not None and wanted not in variants:
         allowed = choices(wanted, variants) if variants else "this study has no variants"
         faults.append(Fault(Place("--variant"), "", f"{show(wanted)} is not allowed; {allowed}"))
@@ -578,9 +628,23 @@ def _no_value(root: Node, name: str, profile: str) -> list[Fault]:
 
 
 def _name_faults(name: str, arm: Node) -> list[Fault]:
-    if name and name == name.strip() and name.isprintable() and "/" not in name:
+    if name and name == name.strip() and "/" not in name:  # that it can be seen is said of every key
         return []
     return [Fault(arm.key, arm.path, f"{show(name)} is no name for an arm; use a few words, without '/'")]
+
+
+def _alike_faults(what: str, named: Mapping[str, Node]) -> list[Fault]:
+    """Names that people, file systems and databases take for one."""
+    text = "in case, blanks or the form of a letter alone; give it another name"
+    return [
+        Fault(named[name].key, named[name].path, f"{show(name)} differs from {what} {show(other)} {text}")
+        for name, other in alike(named)
+    ]
+
+
+def _long_name(name: str, arm: Node) -> Fault:
+    text = f"{show(name)} is no name for an arm; it has {len(name):,} characters, at most {ARM}"
+    return Fault(arm.key, arm.path, text)
 
 
 def _unstated(base: Node | None, arm: Node) -> list[Fault]:

@@ -1,7 +1,8 @@
 """Where runs are logged: the protocol, and a twin in memory that obeys it.
 
 A run in a log is named by study, profile, arm and key (spec id and code fingerprint). Starting one that is there
-already continues it. A point that is logged already is not logged again.
+already continues it, unless it came from elsewhere (`Card.imported`): values of two machines do not meet in one run. A
+point that is logged already is not logged again.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -13,6 +14,7 @@ from typing import Literal, NamedTuple, Protocol
 from pipelines.host import Host
 from rhmc.types import Metrics
 
+VALUES_ONLY = "values_only"  # tag of a run that came from a bundle without its policy
 Status = Literal["running", "finished", "failed", "interrupted"]
 ADOPTED = "adopted"  # tag of a run that other code made: which, and what was compared
 
@@ -41,6 +43,7 @@ class Card(NamedTuple):
     trial: int | None = None  # of a search: then the run stands for all of its seeds
     host: Host = Host()  # that starts it
     modules: Mapping[str, str] = MappingProxyType({})  # digests of the code that decides it
+    imported: str = ""  # names what a bundle has of it, should it come from one
 
     @property
     def key(self) -> str:
@@ -63,6 +66,8 @@ class Recorded(NamedTuple):
     commit: str
     stale: bool = False  # marked as no part of the latest plan
     host: Host = Host()
+    error: str = ""  # why it failed, one line
+    values_only: bool = False  # taken in from a bundle without policies
     modules: Mapping[str, str] = MappingProxyType({})  # of the code that made it, where that was kept
     adopted: str = ""  # from which code, and what was compared, if another code made it
 
@@ -123,7 +128,11 @@ class Tracker(Protocol):
         ...
 
     def start(self, card: Card) -> RunLog:
-        """Begin a run, or continue it."""
+        """Begin a run, or continue it; one of another origin is dropped, and begun anew."""
+        ...
+
+    def drop(self, ref: str) -> None:
+        """Take a run that is not finished out of the log."""
         ...
 
     def rows(self, refs: Sequence[str], metrics: Collection[str] | None = None) -> list[Row]:
@@ -132,6 +141,10 @@ class Tracker(Protocol):
 
     def file(self, ref: str, name: str, folder: Path) -> Path | None:
         """Write a file that a run keeps to a folder; None if it keeps none of that name."""
+        ...
+
+    def files_of(self, ref: str) -> str:
+        """Where the files of a run are looked for, for a person."""
         ...
 
     def publish(self, note: str, files: Mapping[str, bytes]) -> None:
@@ -223,7 +236,7 @@ class MemoryTracker:
         return [
             Recorded(
                 *(r.ref, r.card.arm, r.card.key, r.status, r.card.commit, "stale" in r.tags, r.card.host),
-                *(r.card.modules, r.tags.get(ADOPTED, "")),
+                *(r.tags.get("error", ""), VALUES_ONLY in r.tags, r.card.modules, r.tags.get(ADOPTED, "")),
             )
             for r in self._mine()
         ]
@@ -245,11 +258,19 @@ class MemoryTracker:
         """See `Tracker`."""
         for run in self._mine():
             if (run.card.arm, run.card.key) == (card.arm, card.key):
+                if run.card.imported != card.imported:
+                    self.drop(run.ref)
+                    continue
                 run.status = "running"
                 return run
-        run = MemoryRun(f"run-{len(self.shelf)}", self.study, card)
+        number = 1 + max((int(run.ref.removeprefix("run-")) for run in self.shelf), default=-1)
+        run = MemoryRun(f"run-{number}", self.study, card)
         self.shelf.append(run)
         return run
+
+    def drop(self, ref: str) -> None:
+        """See `Tracker`."""
+        self.shelf[:] = [run for run in self.shelf if run.ref != ref]
 
     def rows(self, refs: Sequence[str], metrics: Collection[str] | None = None) -> list[Row]:
         """See `Tracker`."""
@@ -263,6 +284,10 @@ class MemoryTracker:
             return None
         (folder / name).write_bytes(run.files[name])
         return folder / name
+
+    def files_of(self, ref: str) -> str:
+        """See `Tracker`."""
+        return f"memory of {ref}"
 
     def publish(self, note: str, files: Mapping[str, bytes]) -> None:
         """See `Tracker`."""

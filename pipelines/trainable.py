@@ -14,10 +14,13 @@ from filelock import Timeout
 from ray.tune import Trainable
 
 from pipelines.cluster import check_code, here
+from pipelines.decoration import EPISODE, WHY_NOT
+from pipelines.health import DivergedError, check, defined
 from pipelines.policy import FILE, SPEC, Saved
 from pipelines.seeds import Seeds
 from pipelines.store import Checkpoints, StoreError, one_line, save_atomically, without_replay
 from pipelines.study import RunSpec
+from rhmc.learner import Learners
 from rhmc.trainer import Trainer
 from rhmc.types import Metrics, State
 
@@ -43,6 +46,8 @@ class RunTrainable(Trainable):
     at the first step of a continued run every point before it as well, so that a log can be made whole. `busy` is true
     where another process is training this run. What goes wrong is a result as well, with `error` (one line) and
     `trace`: were it raised, Ray could not be told to replace a worker that died and to leave alone one that failed.
+    `diverged` is true where a value is not finite: the same settings will come to the same end. The points then end
+    before it.
     """
 
     def setup(self, config: dict[str, Any]) -> None:
@@ -78,6 +83,8 @@ class RunTrainable(Trainable):
             raise  # free now or not: whoever had it may have finished the run, so the driver looks first
         self.trainer = self.make_trainer()
         if state := self.checkpoints.newest():
+            if state.get(SPEC, self.job["spec"]) != self.job["spec"]:
+                raise StoreError(f"{self.checkpoints.folder}: the checkpoints are of another run; move the folder away")
             self.load_state(state)
 
     def make_trainer(self) -> Trainer | Seeds:
@@ -94,6 +101,8 @@ class RunTrainable(Trainable):
             return self.ended
         try:
             return self._step(self.trainer)
+        except DivergedError as error:
+            return failure(error) | {"diverged": True, "points": self.history[self.reported :]}
         except Exception as error:
             return failure(error)
 
@@ -112,10 +121,13 @@ class RunTrainable(Trainable):
         spent = time.perf_counter() - start
         self.seconds += spent
         timing = {"time/seconds": self.seconds, "time/steps_per_second": (trainer.step - before) / spent}
-        self.history.append(metrics | timing)
+        point = defined(metrics)
+        check(point, {"learners": [one.state_dict() for one in learners(trainer)]})
+        self.history.append(point | timing)
 
     def _save(self, trainer: Trainer | Seeds) -> None:
         state = self.state()
+        check({"step": float(trainer.step)}, state["trainer"])  # the rest of it, such as statistics of rewards
         if trainer.done:  # also where nothing is left to train: the file that a killed worker left may be damaged
             state["trainer"] = without_replay(state["trainer"])  # nothing more is learned from it
             kept = state["trainer"] | {SPEC: self.job["spec"]}
@@ -128,13 +140,15 @@ class RunTrainable(Trainable):
 
     def _animate(self, kept: State) -> None:
         """Draw an episode. Training is over and a copy of the policy acts; what goes wrong here is only noted."""
-        from pipelines.render import EPISODE, WHY_NOT, episode_gif, write
-
         try:
+            from pipelines.render import episode_gif, write
+
             spec = RunSpec.model_validate_json(self.job["spec"])
             write(self.checkpoints.folder / EPISODE, episode_gif(Saved(spec, kept["algorithm"]), frames=FRAMES))
         except Exception as error:
-            (self.checkpoints.folder / WHY_NOT).write_text(f"{type(error).__name__}: {one_line(error)}\n")
+            with suppress(OSError):  # no room for the note either
+                words = f"{type(error).__name__}: {one_line(error)}\n"
+                (self.checkpoints.folder / WHY_NOT).write_text(words, encoding="utf-8")
 
     def state(self) -> State:
         """All of the run between two points: the trainer, and the metrics so far for a log that missed some."""
@@ -171,6 +185,12 @@ class RunTrainable(Trainable):
         self.lock.release()
 
 
+def learners(trainer: Trainer | Seeds) -> Learners:
+    """Every network that learns, of all seeds."""
+    each = trainer.trainers.values() if isinstance(trainer, Seeds) else [trainer]
+    return [learner for one in each for learner in one.algorithm.learners()]
+
+
 def ending(*, stopped: bool = False, **more: Any) -> dict[str, Any]:
     """A last result without points."""
     return {"done": True, "stopped": stopped, "points": [], "seconds": 0.0} | more
@@ -178,5 +198,5 @@ def ending(*, stopped: bool = False, **more: Any) -> dict[str, Any]:
 
 def failure(error: Exception) -> dict[str, Any]:
     """The last result of a run that cannot go on."""
-    line = str(error) if isinstance(error, StoreError) else f"{type(error).__name__}: {one_line(error)}"
+    line = str(error) if isinstance(error, StoreError | DivergedError) else f"{type(error).__name__}: {one_line(error)}"
     return ending(error=line, trace=traceback.format_exc())

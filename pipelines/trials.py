@@ -14,7 +14,7 @@ import math
 import os
 import sqlite3
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -25,10 +25,12 @@ from optuna.pruners import BasePruner, MedianPruner, NopPruner, SuccessiveHalvin
 from optuna.samplers import BaseSampler, RandomSampler, TPESampler
 from optuna.storages import BaseStorage, InMemoryStorage, RDBStorage
 from optuna.trial import FrozenTrial, TrialState
-from sqlalchemy.engine import make_url
 from sqlalchemy.exc import SQLAlchemyError
 
+from pipelines.addresses import fault, scrubbed, without_password
+from pipelines.litter import part_of, remove
 from pipelines.search import Dimension, Pruner, Sampler, Search, Value
+from pipelines.sqlite import address, connecting, reading_address, settle, sqlite_file
 from pipelines.store import Home, StoreError, one_line
 from pipelines.study import Setting
 from rhmc.types import Metrics
@@ -69,20 +71,19 @@ class Ledger:
     Args:
         search: whose.
         arm: its name.
-        fingerprint: of the code.
         storage: see `open_storage`.
     """
 
-    def __init__(self, search: Search, arm: str, fingerprint: str, storage: BaseStorage) -> None:
+    def __init__(self, search: Search, arm: str, storage: BaseStorage) -> None:
         self.search, self.arm = search, arm
-        self.name = study_name(search, arm, fingerprint)
-        self.study = optuna.create_study(
-            storage=storage,
-            study_name=self.name,
-            direction="maximize",
-            pruner=make_pruner(search.pruner),
-            load_if_exists=True,
-        )
+        self.name = study_name(search, arm)
+        pruner = make_pruner(search.pruner)
+        if self.name in optuna.get_all_study_names(storage):  # which may be closed to writers
+            self.study = optuna.load_study(study_name=self.name, storage=storage, pruner=pruner)
+        else:
+            self.study = optuna.create_study(
+                storage=storage, study_name=self.name, direction="maximize", pruner=pruner, load_if_exists=True
+            )
         self.space = search.arms[arm].space
         self.live: dict[int, optuna.Trial] = {}
 
@@ -150,6 +151,15 @@ class Ledger:
             self._close(place, "pruned", f"refused: {one_line(error)}", TrialState.PRUNED)
             return None
 
+    def over(self) -> list[Asked]:
+        """The trials that nothing more is done for, to be asked after `take_up`."""
+        found = []
+        for place, trial in self.latest().items():
+            if trial.state not in (TrialState.RUNNING, TrialState.WAITING):
+                with suppress(ValueError):  # refused by the method: never trained
+                    found.append(Asked(self.arm, place, trial.params, self.search.arms[self.arm].at(trial.params)))
+        return found
+
     def report(self, trial: Asked, point: Metrics, number: int) -> str:
         """Take in a point of a trial's curve.
 
@@ -186,7 +196,7 @@ class Ledger:
 
     def _close(self, number: int, key: str, text: str, state: TrialState) -> None:
         live = self.live.pop(number)
-        live.set_user_attr(key, text[:2000])
+        live.set_user_attr(key, scrubbed(text)[:2000])
         self.study.tell(live, state=state)
 
     def best(self) -> Best | None:
@@ -217,17 +227,17 @@ def values_of(trial: FrozenTrial) -> dict[str, Any]:
     return trial.params | trial.system_attrs.get("fixed_params", {})
 
 
-def study_name(search: Search, arm: str, fingerprint: str) -> str:
+def study_name(search: Search, arm: str) -> str:
     """An arm's study in Optuna."""
-    return f"{search.name} ({search.profile}) / {arm} / {search.identity(arm, fingerprint)}"
+    return f"{search.name} ({search.profile}) / {arm} / {search.identity(arm)}"
 
 
-def look(search: Search, arm: str, fingerprint: str, storage: BaseStorage) -> tuple[Ledger, int]:
+def look(search: Search, arm: str, storage: BaseStorage) -> tuple[Ledger, int]:
     """An arm's ledger for reading, empty where there is none, and how many trials have other settings or other code."""
-    name, names = study_name(search, arm, fingerprint), optuna.get_all_study_names(storage)
+    name, names = study_name(search, arm), optuna.get_all_study_names(storage)
     others = [n for n in names if n != name and n.rpartition(" / ")[0] == name.rpartition(" / ")[0]]
     stale = sum(len(optuna.load_study(study_name=n, storage=storage).get_trials(deepcopy=False)) for n in others)
-    return Ledger(search, arm, fingerprint, storage if name in names else InMemoryStorage()), stale
+    return Ledger(search, arm, storage if name in names else InMemoryStorage()), stale
 
 
 # From the file's words to Optuna's
@@ -289,7 +299,7 @@ class _Standing:
 
 def storage_url(home: Home) -> str:
     """`$OPTUNA_STORAGE`, such as `postgresql://user@host/optuna`, or SQLite in the work folder."""
-    return os.environ.get("OPTUNA_STORAGE") or f"sqlite:///{home.searches}"
+    return os.environ.get("OPTUNA_STORAGE") or address(home.searches)
 
 
 def open_storage(home: Home, *, write: bool = True) -> BaseStorage | None:
@@ -300,13 +310,16 @@ def open_storage(home: Home, *, write: bool = True) -> BaseStorage | None:
     """
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     url = storage_url(home)
+    shown = without_password(url)
+    if said := fault("OPTUNA_STORAGE", url):
+        raise StoreError(said)
     if "://" not in url:
-        raise StoreError(f"OPTUNA_STORAGE={url}: not the address of a database; sqlite:///FILE is one")
+        raise StoreError(f"OPTUNA_STORAGE={shown}: not the address of a database; sqlite:///FILE is one")
     try:
         with explained(url):
             return _open(url, write)
     except (OSError, ImportError, RuntimeError) as error:
-        raise StoreError(f"{_shown(url)}: Optuna cannot use this database: {one_line(error)}") from error
+        raise StoreError(f"{shown}: Optuna cannot use this database: {one_line(error)}") from error
 
 
 @contextmanager
@@ -323,10 +336,13 @@ def opened(home: Home, *, write: bool = True) -> Iterator[BaseStorage | None]:
 
 def _open(url: str, write: bool) -> BaseStorage | None:
     if not url.startswith("sqlite:///"):
-        return RDBStorage(url, engine_kwargs={"pool_pre_ping": True})
-    file = Path(url.removeprefix("sqlite:///"))
-    if not write and not file.exists():
-        return None
+        return RDBStorage(url, engine_kwargs={"pool_pre_ping": True, "connect_args": connecting(url)})
+    file = sqlite_file(url)
+    if not write:
+        if not file.exists() or file.stat().st_size == 0:
+            return None
+        settle(file)
+        return RDBStorage(reading_address(file), skip_table_creation=True)
     _create(file)
     return RDBStorage(url, engine_kwargs={"connect_args": {"timeout": 60}})
 
@@ -338,13 +354,12 @@ def _create(file: Path) -> None:
     with FileLock(f"{file}.lock"):
         if file.exists() and file.stat().st_size > 0:
             return
-        part = file.with_name(f"{file.name}.part")
-        part.unlink(missing_ok=True)
+        part = part_of(file)
         try:
-            RDBStorage(f"sqlite:///{part}").engine.dispose()
+            RDBStorage(address(part)).engine.dispose()
             part.replace(file)
         finally:
-            part.unlink(missing_ok=True)
+            remove(part)
 
 
 @contextmanager
@@ -355,11 +370,4 @@ def explained(url: str) -> Iterator[None]:
     except StoreError:
         raise
     except (optuna.exceptions.OptunaError, SQLAlchemyError, sqlite3.Error) as error:
-        raise StoreError(f"{_shown(url)}: Optuna cannot go on: {one_line(error)}") from error
-
-
-def _shown(url: str) -> str:
-    try:
-        return make_url(url).render_as_string(hide_password=True)
-    except SQLAlchemyError:
-        return "OPTUNA_STORAGE"
+        raise StoreError(f"{without_password(url)}: Optuna cannot go on: {one_line(error)}") from error

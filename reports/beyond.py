@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from itertools import combinations
+from textwrap import wrap
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ PANELS = (
     ("conflicts", "targets with two agents or more"),
     ("free", "targets with no agent"),
 )
+LETTERS = 60  # of a name on a line of a legend
 RULERS = ("best_window", "planner", "free_heading_bound")  # beside transferred policies
 
 
@@ -65,7 +67,7 @@ def fig_assignments(results: Results, study: str) -> Drawing | None:
             axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: steps(x)))
             axes.xaxis.set_major_locator(MaxNLocator(4))
             axes.set_ylim(bottom=0)
-        names = [f"{arm} ({_count(results, study, arm)})" for arm in arms]
+        names = ["\n".join(wrap(f"{arm} ({_count(results, study, arm)})", LETTERS)) for arm in arms]
         how: dict[str, Any] = {"ncols": min(4, len(arms)), "frameon": False, "fontsize": 8.5}
         figure.legend(list(handles.values()), names, loc="lower left", bbox_to_anchor=(0.03, 0.07), **how)
         words = "mean per state of the training itself, exploration included, against environment steps"
@@ -263,7 +265,7 @@ def _panel(
         for count, x in by.items():
             if np.isfinite(x.low):
                 axes.plot([count, count], [x.low, x.high], color=colour, linewidth=1.2, alpha=0.6, zorder=3)
-        labels.append((means[-1], f"{arm} {number(means[-1])}", colour))
+        labels.append((means[-1], "\n".join(wrap(f"{arm} {number(means[-1])}", LETTERS // 2)), colour))
     axes.set_xticks(sorted({count for by in arms.values() for count in by}))
     axes.set_xlabel(axis.words)
     axes.set_ylabel("return")

@@ -1,25 +1,32 @@
 """Build a report: `python -m reports.build --profile quick`. The same tables give the same bytes."""
 
 import argparse
+import fcntl
 import json
 import math
+import os
 import shutil
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple, TypeVar
 
 from reports import beyond, comparison, page, scaling, tables
 from reports import claims as rules
-from reports.canvas import save
+from reports.canvas import save, write_csv
 from reports.claims import VERDICTS, Claim
-from reports.frame import Results, TableError, load
-from reports.gallery import Picture, gallery, in_short, study_gallery
-from reports.paper import Paper, read
+from reports.escape import code, markdown, prose, stem, words
+from reports.frame import Results, TableError, load, mixed
+from reports.gallery import Picture, gallery, in_short, reason, study_gallery
+from reports.letters import LOST
+from reports.paper import Paper, PaperError, read
 from reports.stats import FEW
 from reports.tables import Table, joined, steps
 
+PART = ".report-"  # begins the name of the folder in which a report is made
+DONE, UNDRAWN, BAD = 0, 1, 2  # exit codes
 MADE = ("figures", "tables", "claims.md", "claims.csv", "claims.json", "index.md", "index.html")
 
 DEFINITIONS = (
@@ -54,6 +61,7 @@ DEFINITIONS = (
 Part = TypeVar("Part")
 FIRST = ("navigation", "coverage", "scaling", "ablation")  # studies of the paper, in its order
 MORE = ("profile_", "better_", "pairs_", "steadiness_", "yardsticks")
+KINDS = ("final", "pairs", "efficiency", "assignments", "steadiness", "agents")  # of tables that every study has
 LAST = ("provenance", "runs")  # tables with a part of their own at the end
 COMPLETE = "Nothing: every planned run is finished."
 DRAWN = "rhmc drawings"
@@ -72,10 +80,22 @@ class Report(NamedTuple):
     short: list[str]  # what came out, a sentence a figure of the paper
 
 
-def build(runs: Path, out: Path, profile: str, study: str | None = None) -> list[Path]:
-    """Read the tables in `runs`, write the report to `out`, and return its files.
+class OutError(ValueError):
+    """The report cannot be written where it should be; the message is one line."""
 
-    Everything is made in a folder beside the old report first, so that a failure leaves the old one as it was.
+
+class Built(NamedTuple):
+    """A report that is written: its files, and a line for each figure that could not be drawn."""
+
+    files: list[Path]
+    undrawn: list[str]
+
+
+def build(runs: Path, out: Path, profile: str, study: str | None = None) -> Built:
+    """Read the tables in `runs`, and write the report to `out`.
+
+    Everything is made in a folder beside the old report first, so that a failure leaves the old one as it was. What a
+    report that was killed left there is removed. A figure that cannot be drawn leaves its place on the page.
 
     Args:
         runs: folder of the exported tables.
@@ -85,21 +105,52 @@ def build(runs: Path, out: Path, profile: str, study: str | None = None) -> list
 
     Raises:
         TableError: the tables are missing or faulty; nothing is written.
+        PaperError: so is `paper.yaml`.
+        OutError: `out` is no folder, cannot be written to, or another report is being written there.
     """
     results, paper = load(runs, profile, study), read()
     made = _whole(results, paper) if study is None else _single(results, paper, study)
+    try:
+        with _held(out), TemporaryDirectory(prefix=PART, dir=out) as folder:
+            written = _write(made, Path(folder))
+            names = [name for name in MADE if (Path(folder) / name).exists()]
+            for name in names:
+                _replace(Path(folder) / name, out / name, Path(folder))
+    except OSError as error:
+        raise OutError(f"{error.filename or out}: cannot be written ({error.strerror or error})") from error
+    files = sorted(path for name in names for path in [out / name, *(out / name).rglob("*")] if path.is_file())
+    return Built(files, _undrawn(written))
+
+
+@contextmanager
+def _held(out: Path) -> Iterator[None]:
+    """Hold the folder of a report while it is written, without what one that was killed left there."""
     out.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(prefix=".report-", dir=out) as folder:
-        _write(made, Path(folder))
-        names = [name for name in MADE if (Path(folder) / name).exists()]
-        for name in names:
-            _replace(Path(folder) / name, out / name)
-    return sorted(path for name in names for path in [out / name, *(out / name).rglob("*")] if path.is_file())
+    folder = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)  # on the folder itself: ends with the process, no file
+        except BlockingIOError as error:
+            raise OutError(f"{out}: another report is being written there; wait for it, or give --out") from error
+        for left in out.glob(f"{PART}*"):
+            shutil.rmtree(left)
+        yield
+    finally:
+        os.close(folder)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Build the report of a profile from its exported tables. Returns 0, or 2 if the tables are faulty."""
-    parser = argparse.ArgumentParser(prog="python -m reports.build", description=main.__doc__)
+def main(argv: Sequence[str] | None = None, shown: Callable[[str], str] = str) -> int:
+    """Build the report of a profile from its exported tables.
+
+    Args:
+        argv: the options.
+        shown: how a message is printed, which names folders as they were typed.
+
+    Returns 0, 1 if a figure could not be drawn, 2 if the tables are faulty: then nothing is written.
+    """
+    parser = argparse.ArgumentParser(
+        prog="python -m reports.build", description=(main.__doc__ or "").partition("\n")[0]
+    )
     parser.add_argument("--profile", default="quick", help="profile that made the runs (default: quick)")
     parser.add_argument("--study", help="report on this study alone")
     parser.add_argument("--runs", type=Path, help="folder of the tables (default: reports/PROFILE/runs)")
@@ -108,12 +159,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     home = Path("reports") / args.profile
     out = args.out or (home / "study" / args.study if args.study else home)
     try:
-        files = build(args.runs or home / "runs", out, args.profile, args.study)
-    except TableError as error:
-        print(error, file=sys.stderr)
-        return 2
-    print(f"{len(files)} files; start with {out / 'index.html'}")
-    return 0
+        built = build(args.runs or home / "runs", out, args.profile, args.study)
+    except (TableError, PaperError, OutError) as error:
+        print(shown(str(error)), file=sys.stderr)
+        return BAD
+    for line in built.undrawn:
+        print(shown(line), file=sys.stderr)
+    print(shown(f"{len(built.files)} files; start with {out / 'index.html'}"))
+    return UNDRAWN if built.undrawn else DONE
 
 
 def _whole(results: Results, paper: Paper) -> Report:
@@ -143,26 +196,53 @@ def definitions(results: Results) -> list[tuple[str, str]]:
     return [(name, words.replace("{episodes}", episodes)) for name, words in DEFINITIONS]
 
 
-def _write(report: Report, folder: Path) -> None:
+def _write(report: Report, folder: Path) -> Report:
+    """Write a report to an empty folder, and return it as it came out."""
     pictures, sheets = folder / "figures", folder / "tables"
     pictures.mkdir()
     sheets.mkdir()
-    for picture in report.pictures:
-        save(picture.drawing, pictures, picture.name)
     for name, table in report.tables.items():
         _save(table, sheets, name)
     if report.claims:
         _write_claims(report.claims, folder)
-    (folder / "index.md").write_text("\n".join(_index(report)) + "\n")
-    (folder / "index.html").write_text(page.render(_content(report, pictures)))
+    report = report._replace(pictures=[_saved(picture, pictures) for picture in report.pictures])
+    _write_text(folder / "index.md", "\n".join(_index(report)) + "\n")
+    _write_text(folder / "index.html", page.render(_content(report, pictures)))
+    return report
+
+
+def _saved(picture: Picture, folder: Path) -> Picture:
+    """Write the files of a figure. One that cannot be drawn has its numbers alone, and says why."""
+    if picture.drawing is None:
+        return picture
+    try:
+        lost = save(picture.drawing, folder, picture.name)
+    except Exception as error:
+        if isinstance(error, OSError):  # a full disk is no fault of the figure
+            raise
+        for kind in ("png", "pdf"):
+            (folder / f"{picture.name}.{kind}").unlink(missing_ok=True)
+        return picture._replace(drawing=None, fault=reason(error))
+    return picture._replace(caption=f"{picture.caption} {LOST}") if lost else picture
+
+
+def _undrawn(report: Report) -> list[str]:
+    """A line for each figure and each animation that a report only has a place for."""
+    pictures = [f"{picture.name}: could not be drawn ({picture.fault})" for picture in report.pictures if picture.fault]
+    faults = {task: page.animation_fault(gif) for task, gif in report.results.episodes.items()}
+    return pictures + [f"episode_{task}.gif: could not be shown ({fault})" for task, fault in faults.items() if fault]
+
+
+def _write_text(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")
 
 
 def _write_claims(found: Sequence[Claim], folder: Path) -> None:
     listed = rules.table(found)
-    listed.numbers.to_csv(folder / "claims.csv", index=False, lineterminator="\n")
+    write_csv(listed.numbers, folder / "claims.csv")
     plain = json.dumps([_plain(claim) for claim in found], indent=1, ensure_ascii=False)
-    (folder / "claims.json").write_text(plain + "\n")
-    (folder / "claims.md").write_text("\n".join(_claims_page(found, listed)) + "\n")
+    _write_text(folder / "claims.json", plain + "\n")
+    _write_text(folder / "claims.md", "\n".join(_claims_page(found, listed)) + "\n")
 
 
 def _tables(results: Results, paper: Paper) -> dict[str, Table]:
@@ -194,28 +274,27 @@ def _study_tables(results: Results, study: str) -> dict[str, Table]:
         "steadiness": steadiness if len(steadiness.shown) else None,
         "agents": scaling.table(results, found) if found else None,
     }
-    return {f"{name}_{study}": table for name, table in every.items() if table}
+    return {f"{name}_{stem(study)}": table for name, table in every.items() if table}
 
 
 def _save(table: Table, folder: Path, name: str) -> None:
-    table.numbers.to_csv(folder / f"{name}.csv", index=False, float_format="%.6g", lineterminator="\n")
-    (folder / f"{name}.md").write_text(f"{table.markdown()}\n")
-    (folder / f"{name}.tex").write_text(table.latex())
+    write_csv(table.numbers, folder / f"{name}.csv", digits="%.6g")
+    _write_text(folder / f"{name}.md", f"{table.markdown()}\n")
+    _write_text(folder / f"{name}.tex", table.latex())
 
 
 def _index(report: Report) -> Iterator[str]:
     results = report.results
-    yield f"# {report.title}\n"
+    yield f"# {markdown(report.title)}\n"
     yield "The same with everything in one page: `index.html`.\n"
     yield f"{_summary(results)}\n"
     if report.short:
-        yield "\n".join(f"- {line}" for line in report.short) + "\n"
+        yield "\n".join(f"- {markdown(line)}" for line in report.short) + "\n"
     if report.gaps:
         yield "Not everything is there yet: see [what is missing](#what-is-missing).\n"
     yield "## Figures\n"
     for picture in report.pictures:
-        yield f"![{picture.heading}](figures/{picture.name}.png)\n"
-        yield f"*{picture.heading}.* {picture.caption} {_links('figures', picture.name, 'PDF', 'numbers')}\n"
+        yield from _figure(picture)
     if not report.pictures:
         yield "No study has a curve yet.\n"
     if report.claims:
@@ -225,7 +304,7 @@ def _index(report: Report) -> Iterator[str]:
         yield f"{listed.markdown()}\n"
     for name, table in report.tables.items():
         if name not in LAST:
-            yield f"## {table.title}\n"
+            yield f"## {markdown(table.title)}\n"
             if table.note:
                 yield f"{table.note}\n"
             yield f"{table.markdown()}\n"
@@ -238,6 +317,15 @@ def _index(report: Report) -> Iterator[str]:
     yield f"{_origin(results)}\n"
     yield f"{report.tables['provenance'].markdown()}\n"
     yield report.tables["runs"].markdown()
+
+
+def _figure(picture: Picture) -> Iterator[str]:
+    heading = markdown(picture.heading)
+    if picture.fault:
+        yield f"*{heading}.* Could not be drawn: {markdown(picture.fault)}\n"
+        return
+    yield f"![{heading}](figures/{picture.name}.png)\n"
+    yield f"*{heading}.* {markdown(picture.caption)} {_links('figures', picture.name, 'PDF', 'numbers')}\n"
 
 
 def _links(folder: str, name: str, first: str, second: str) -> str:
@@ -255,16 +343,16 @@ def _content(report: Report, pictures: Path) -> Mapping[str, Any]:
         "short": report.short,
         "folded": page.FOLDED,
         "tally": page.verdicts(report.claims),
-        "gaps": [gap.replace("`", "") for gap in report.gaps],
+        "gaps": [words(gap) for gap in report.gaps],
         "claims": [page.card(claim) for claim in report.claims],
         "sections": _sections(report, pictures),
         "definitions": definitions(results),
-        "mixed": results.runs["fingerprint"].dropna().astype(str).replace("", None).nunique() > 1,
+        "mixed": mixed(results.runs),
         "provenance": page.provenance(results),
         "made": page.grid("provenance", report.tables["provenance"]),
         "runs": page.grid("runs", runs),
         "counted": "runs" if set(results.runs["study"]) <= set(results.studies) else "runs, with scripted policies",
-        "ids": [f"run-{run}" if first else "" for run, first in _first_seen(runs)],
+        "ids": [f"run-{stem(run)}" if first else "" for run, first in _first_seen(runs)],
         "foot": f"Built from the exported tables of profile {results.profile}; the same tables give the same page.",
     }
 
@@ -281,12 +369,12 @@ def _sections(report: Report, pictures: Path) -> list[page.Section]:
     """The method and its tasks first, then a part per study, those of the paper first, then what belongs to none."""
     others = [name for name in report.results.studies if name not in FIRST]
     studies = [name for name in FIRST if name in report.results.studies] + others
-    shortest = sorted(studies, key=len)  # of `letter` and `coverage_letter` the longer one has the last word
-    of_table = {name: study for study in shortest for name in report.tables if name.endswith(f"_{study}")}
+    owners = {stem(study): study for study in studies}
+    of_table = {name: owner for name in report.tables if (owner := owners.get(_of_study(name)))}
     of_table |= {name: "ablation" for name in ("table_2",) if name in report.tables}
     whole = [_section(report, pictures, "method", "The method and its tasks", "", ("table_1",))]
     whole += [
-        _section(report, pictures, f"study-{study.replace('@', '-')}", _heading(report.results, study), study, names)
+        _section(report, pictures, f"study-{stem(study)}", _heading(report.results, study), study, names)
         for study in studies
         for names in [tuple(name for name, owner in of_table.items() if owner == study)]
     ]
@@ -295,6 +383,12 @@ def _sections(report: Report, pictures: Path) -> list[page.Section]:
         _section(report, pictures, "scale", "Scripted policies, bounds, transfer, encoder, Theorem 1", "-", rest)
     )
     return [section for section in whole if section.plates or section.grids]
+
+
+def _of_study(name: str) -> str:
+    """What follows the kind of a study's table in its name."""
+    kind, _, rest = name.partition("_")
+    return rest if kind in KINDS else ""
 
 
 def _section(report: Report, pictures: Path, name: str, title: str, study: str, names: Sequence[str]) -> page.Section:
@@ -354,21 +448,21 @@ def _summary(results: Results) -> str:
         plan, budget = results.plan(study), results.budget(study)
         done = int((plan["status"] == "finished").sum())
         question = str(plan["question"].iloc[0])
-        words = f"{done} of {len(plan)} runs finished, {steps(budget) if budget else 'unknown'} steps each"
+        said = f"{done} of {len(plan)} runs finished, {steps(budget) if budget else 'unknown'} steps each"
         episodes = results.final_episodes(study)
-        words += f", final return over {episodes} episodes" if episodes else ""
-        lines.append(f"- **{study}**: {question} ({len(results.arms(study))} arms, {words})")
+        said += f", final return over {episodes} episodes" if episodes else ""
+        lines.append(f"- **{markdown(study)}**: {prose(question)} ({len(results.arms(study))} arms, {said})")
     return "\n".join(lines) or "No study has runs yet."
 
 
 def _origin(results: Results) -> str:
     """Code and commit that made the runs."""
     found = []
-    for column, word in (("fingerprint", "code fingerprint"), ("commit", "commit")):
+    for column, word in (("fingerprint", "code"), ("commit", "commit")):
         values = sorted(set(results.runs[column].dropna().astype(str)) - {""})
-        mixed = " (**the runs were not all made by the same code**)" if column == "fingerprint" and values[1:] else ""
-        found.append(f"{word} {joined(f'`{value}`' for value in values) or 'unknown'}{mixed}")
-    return f"Made by {found[0]}, {found[1]}."
+        found.append(f"{word} {joined(map(code, values)) or 'unknown'}")
+    warning = " (**the runs were not all made by the same code**)" if mixed(results.runs) else ""
+    return f"Made by {found[0]}{warning}, {found[1]}."
 
 
 def _count(claims: Table) -> str:
@@ -383,14 +477,14 @@ def _claims_page(found: Sequence[Claim], listed: Table) -> Iterator[str]:
     yield f"{_count(listed)}\n"
     for claim in found:
         yield f"## {claim.id}: {claim.judgement}\n"
-        yield f"> {claim.text} ({claim.place})\n"
-        yield f"- Paper: {claim.paper}"
-        yield f"- Ours: {rules.describe(claim.ours) or 'nothing to show'}"
-        yield f"- Why: {claim.reason}"
+        yield f"> {markdown(f'{claim.text} ({claim.place})')}\n"
+        yield f"- Paper: {markdown(claim.paper)}"
+        yield f"- Ours: {markdown(rules.describe(claim.ours)) or 'nothing to show'}"
+        yield f"- Why: {markdown(claim.reason)}"
         if claim.provisional:
-            yield f"- Provisional: {'; '.join(claim.caveats)}"
+            yield f"- Provisional: {markdown('; '.join(claim.caveats))}"
         yield f"- Rule: {claim.rule}"
-        yield f"- Runs: {', '.join(f'`{run}`' for run in claim.runs) or 'none'}\n"
+        yield f"- Runs: {', '.join(map(code, claim.runs)) or 'none'}\n"
 
 
 def _plain(claim: Claim) -> dict[str, object]:
@@ -402,10 +496,10 @@ def _plain(claim: Claim) -> dict[str, object]:
     return claim._asdict() | {"ours": ours, "provisional": claim.provisional}
 
 
-def _replace(new: Path, old: Path) -> None:
-    """Put a finished file or folder in the place of the old one."""
-    if old.is_dir():
-        shutil.rmtree(old)
+def _replace(new: Path, old: Path, aside: Path) -> None:
+    """Put a finished file or folder in the place of the old one, which goes to the folder `aside`."""
+    with suppress(FileNotFoundError):
+        old.replace(aside / f"old-{old.name}")
     new.replace(old)
 
 

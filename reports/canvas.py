@@ -11,6 +11,9 @@ from matplotlib import style
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from reports import letters
+from reports.escape import cell
+
 # One colour and line per arm, everywhere. They differ in lightness as well, for colour-blind readers and grey print,
 # and every curve is named at its end.
 LOOKS: Mapping[str, tuple[str, str]] = {
@@ -33,7 +36,6 @@ DASHES = ("-", "--", ":", "-.")  # by round of those colours
 INK, QUIET, FAINT = "#222222", "#666666", "#B5B5B5"
 BLUE, ORANGE, GREEN, PAPER = "#0072B2", "#D55E00", "#009E73", "#F4F6F8"
 STYLE: dict[str, Any] = {
-    "font.family": "DejaVu Sans",
     "font.size": 9.5,
     "text.color": INK,
     "axes.edgecolor": FAINT,
@@ -65,7 +67,7 @@ class Drawing(NamedTuple):
 @contextmanager
 def styled() -> Iterator[None]:
     """Draw in the project's style, whatever the machine's settings are."""
-    with style.context(["default", STYLE]):
+    with style.context(["default", STYLE | letters.settings()]):
         yield
 
 
@@ -88,14 +90,26 @@ def foot(figure: Figure, text: str) -> None:
     figure.text(MARGIN, 0.12 / float(figure.get_size_inches()[1]), text, fontsize=7.5, color=QUIET, linespacing=1.5)
 
 
-def save(drawing: Drawing, folder: Path, name: str) -> list[Path]:
-    """Write `<name>.png`, `.pdf` and `.csv` to a folder."""
-    png, pdf, csv = (folder / f"{name}.{kind}" for kind in ("png", "pdf", "csv"))
+def save(drawing: Drawing, folder: Path, name: str) -> bool:
+    """Write `<name>.csv`, then `.png` and `.pdf`, to a folder. Whether a letter is in no font, see `letters`."""
+    write_csv(drawing.numbers, folder / f"{name}.csv", digits="%.6g")
     with styled():
-        drawing.figure.savefig(png, metadata={"Software": None})
-        drawing.figure.savefig(pdf, metadata={"CreationDate": None, "Creator": None, "Producer": None})
-    drawing.numbers.to_csv(csv, index=False, float_format="%.6g", lineterminator="\n")
-    return [png, pdf, csv]
+        lost = letters.settle(drawing.figure)
+        drawing.figure.savefig(folder / f"{name}.png", metadata={"Software": None})
+        drawing.figure.savefig(
+            folder / f"{name}.pdf", metadata={"CreationDate": None, "Creator": None, "Producer": None}
+        )
+    return lost
+
+
+def write_csv(table: pd.DataFrame, path: Path, digits: str | None = None) -> None:
+    """A table with its words as `escape.cell` has them; numbers stay numbers. digits: how a float is written."""
+    plain = table.copy()
+    for name, column in table.items():
+        if not pd.api.types.is_numeric_dtype(column):
+            plain[name] = column.map(lambda value: cell(value) if isinstance(value, str) else value)
+    plain = plain.rename(columns=lambda name: cell(str(name)))
+    plain.to_csv(path, index=False, float_format=digits, lineterminator="\n", encoding="utf-8")
 
 
 def look(arm: str, arms: Sequence[str]) -> tuple[str, str]:

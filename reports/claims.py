@@ -7,7 +7,7 @@ The docstring of a rule is printed in the report as the rule's text. What the ru
 - A verdict from less than the paper's training budget or from fewer than `FEW` seeds is provisional, and says why.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from inspect import cleandoc
 from typing import Literal, NamedTuple, get_args
@@ -16,8 +16,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from reports.escape import markdown
 from reports.frame import ERRORS, FINAL, THEOREM, YARDSTICKS, Results
-from reports.paper import Paper
+from reports.paper import Paper, PaperError
 from reports.stats import FEW, Interval, change, difference, interval
 from reports.tables import NONE, Table, estimate, joined, number, percent, steps
 
@@ -149,7 +150,13 @@ Rule = Callable[[Evidence], Finding]
 
 
 def judge(results: Results, paper: Paper) -> list[Claim]:
-    """Every claim of the paper that has a rule, in the paper's order."""
+    """Every claim of the paper, in its order.
+
+    Raises:
+        PaperError: what a rule looks at is not stated, or a claim has no rule.
+    """
+    if faults := [f"paper.yaml: {fault}" for fault in _unstated(paper)]:
+        raise PaperError("\n".join(faults))
     return [_judge(name, rule, results, paper) for name, rule in RULES.items()]
 
 
@@ -338,6 +345,37 @@ def c13(see: Evidence) -> Finding:
     return Finding("not reproduced", reason, ours)
 
 
+# What the rules take from `paper.yaml`: numbers of claims, and arms of studies.
+STATED: Mapping[str, tuple[str, ...]] = {
+    "C3": ("level",),
+    "C4": ("HiT-MAC", "QMIX"),
+    "C5": ("peak",),
+    "C8": ("full", "without", "stated"),
+    "C9": ("full", "without", "stated"),
+    "C10": ("full", "no filter"),
+    "C12": ("RHMC", "QMIX"),
+}
+LISTED = ("coverage", "navigation")
+
+
+def _unstated(paper: Paper) -> Iterator[str]:
+    """What keeps the rules from being applied."""
+    for name in RULES:
+        if name not in paper.claims:
+            yield f"claims.{name}: missing; there is a rule for it"
+        else:
+            numbers = paper.claims[name].numbers
+            for key in STATED.get(name, ()):
+                if key not in numbers:
+                    yield f"claims.{name}.numbers.{key}: missing; there are {', '.join(numbers) or 'none'}"
+    for name in paper.claims:
+        if name not in RULES:
+            yield f"claims.{name}: no rule in claims.py; there are rules for {', '.join(RULES)}"
+    for study in LISTED:
+        if study not in paper.arms:
+            yield f"arms.{study}: missing; the arms that the paper shows"
+
+
 RULES: Mapping[str, Rule] = {
     "C1": c1,
     "C2": c2,
@@ -377,17 +415,18 @@ def table(claims: Sequence[Claim]) -> Table:
     shown = pd.DataFrame(
         {
             "Claim": claim.id,
-            "The paper says": claim.text,
-            "Paper": f"{claim.paper} ({claim.place})",
-            "Ours [95 %]": describe(claim.ours).replace("; ", "<br>") or NONE,
+            "The paper says": markdown(claim.text),
+            "Paper": markdown(f"{claim.paper} ({claim.place})"),
+            "Ours [95 %]": "<br>".join(markdown(f"{name} {value}") for name, value in described(claim.ours)) or NONE,
             "Verdict": f"**{claim.judgement}**",
             "Why": " ".join(
-                [claim.reason, *([f"*{_capital('; '.join(claim.caveats))}.*"] if claim.provisional else [])]
+                [markdown(claim.reason)]
+                + ([f"*{markdown(_capital('; '.join(claim.caveats)))}.*"] if claim.provisional else [])
             ),
         }
         for claim in claims
     )
-    return Table("The paper's claims", numbers, shown)
+    return Table("The paper's claims", numbers, shown, marked=True)
 
 
 def describe(ours: Mapping[str, Interval]) -> str:

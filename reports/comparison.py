@@ -7,6 +7,7 @@ for all arms and cancels in a difference; single episodes are not exported, so t
 from collections.abc import Sequence
 from itertools import combinations
 from math import comb
+from textwrap import wrap
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ from reports.frame import FINAL, Results
 from reports.stats import Interval, area, difference, first_at, holm, improvement, interval, welch
 from reports.tables import NONE, Table, estimate, number, steps
 
+LETTERS, LONGEST = 44, 60  # of a name on a line of a legend, and beside a matrix
 MOST = 12  # arms of a matrix that can still be read
 LEVEL_SHARE = 0.9  # of the best arm's mean final return, where no scripted policy gives a level
 RULER = {"coverage": "best_window", "navigation": "nearest"}  # each agent alone, without learning
@@ -145,16 +147,17 @@ def profile(results: Results, study: str) -> Drawing | None:
         figure = blank(9.0, 4.6)
         head(figure, f"Performance profile, study {study}", "share of seeds that end at or above a score")
         axes = figure.add_axes((0.075, 0.17, 0.6, 0.66))
+        lines, names = [], []
         for arm in shares:
             colour, dashes = look(arm, results.arms(study))
-            words = f"{arm} ({len(values[arm])} seeds)"
+            names.append("\n".join(wrap(f"{arm} ({len(values[arm])} seeds)", LETTERS)))
             own = np.append(values[arm][:1], values[arm])  # drawn from its first seed to its last, lines apart
             left = np.append(1.0, above(values[arm], np.nextafter(values[arm], np.inf)))
-            axes.step(own, left, where="post", color=colour, linestyle=dashes, linewidth=1.8, label=words)
+            lines += axes.step(own, left, where="post", color=colour, linestyle=dashes, linewidth=1.8)
         axes.set_xlabel("final return")
         axes.set_ylabel("share of seeds")
         axes.set_ylim(-0.02, 1.04)
-        figure.legend(loc="upper left", bbox_to_anchor=(0.69, 0.85), frameon=False, fontsize=8)
+        figure.legend(lines, names, loc="upper left", bbox_to_anchor=(0.69, 0.85), frameon=False, fontsize=8)
         foot(
             figure,
             "A line right of another at every height is better in distribution; lines that cross are not ordered.",
@@ -175,16 +178,18 @@ def matrix(results: Results, study: str) -> Drawing | None:
         return None
     table = np.array([[_beats(results, study, a, b) for b in arms] for a in arms])
     side = 0.52 * len(arms)
-    left = 0.35 + 0.082 * max(map(len, arms))
+    names = ["\n".join(wrap(arm, LONGEST)) for arm in arms]
+    longest, last = (max(map(len, text.split("\n"))) for text in ("\n".join(names), names[-1]))
+    left = 0.35 + 0.082 * longest
     with styled():
-        figure = blank(max(left + side + 0.4 + 0.05 * len(arms[-1]), 6.4), side + 1.5 + 0.055 * max(map(len, arms)))
+        figure = blank(max(left + side + 0.4 + 0.05 * last, 6.4), side + 1.5 + 0.055 * longest)
         width, height = figure.get_size_inches()
         head(figure, f"Probability of improvement, study {study}", "that a seed of the row beats one of the column")
         axes = figure.add_axes((left / width, 0.45 / height, side / width, side / height))
         axes.imshow(table, cmap="RdBu", vmin=-0.3, vmax=1.3, aspect="auto")
         axes.grid(visible=False)
-        axes.set_xticks(range(len(arms)), arms, rotation=35, ha="left", rotation_mode="anchor", fontsize=8)
-        axes.set_yticks(range(len(arms)), arms, fontsize=8)
+        axes.set_xticks(range(len(arms)), names, rotation=35, ha="left", rotation_mode="anchor", fontsize=8)
+        axes.set_yticks(range(len(arms)), names, fontsize=8)
         axes.xaxis.tick_top()
         for (i, j), value in np.ndenumerate(table):
             if i != j:

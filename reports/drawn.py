@@ -1,4 +1,4 @@
-"""What the package writes for the drawn figures, checked as it is read: networks (Figures 1 to 3) and scenes (4, 5, 8).
+"""What the package writes as JSON, checked as it is read: methods (Table 1), networks and scenes (Figures 1 to 5, 8).
 
 A part that is not there draws nothing; a part of another form is a fault of one line.
 """
@@ -9,7 +9,9 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-MODULES, SCENES = "modules.json", "scenes.json"
+METHODS, MODULES, SCENES = "methods.json", "modules.json", "scenes.json"
+METHOD = ("kind", "name", "source", "family", "training", "execution", "critic", "coordination")
+OURS = "what `rhmc drawings --out` writes"
 Point = tuple[float, float]
 Count = Annotated[int, Field(ge=0)]
 T = TypeVar("T")
@@ -19,6 +21,37 @@ class Part(BaseModel):
     """A part of a file."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
+
+
+class Kind(BaseModel):
+    """What every task says of itself; the rest of its configuration is kept as it is."""
+
+    model_config = ConfigDict(frozen=True, extra="allow")
+    kind: str
+
+
+class Size(Part):
+    """Parameters of a method's networks: those that act, and all that learn."""
+
+    task: Kind
+    encoder: str
+    acting: int
+    all: int
+
+
+class Method(Part):
+    """A method of Table 1."""
+
+    kind: str
+    name: str
+    source: str
+    family: str
+    training: str
+    execution: str
+    critic: str
+    coordination: str
+    actions: tuple[str, ...]
+    parameters: tuple[Size, ...]
 
 
 class Input(Part):
@@ -161,6 +194,13 @@ class Scenes(Part):
     counterexamples: tuple[Counterexample, ...] = ()
 
 
+def read_methods(folder: Path, faults: list[str]) -> list[dict[str, Any]]:
+    """The records of the methods, as plain values; none without the file."""
+    what = "the methods as `rhmc methods --out` writes them"
+    found = _read(folder / METHODS, TypeAdapter(tuple[Method, ...]), faults, what) or ()
+    return [method.model_dump() for method in found]
+
+
 def read_modules(folder: Path, faults: list[str]) -> tuple[Build, ...]:
     """The method's networks, one build per encoder; none without the file."""
     return _read(folder / MODULES, TypeAdapter(tuple[Build, ...]), faults) or ()
@@ -171,16 +211,34 @@ def read_scenes(folder: Path, faults: list[str]) -> Scenes | None:
     return _read(folder / SCENES, TypeAdapter(Scenes), faults)
 
 
-def _read(path: Path, form: TypeAdapter[T], faults: list[str]) -> T | None:
+def content(path: Path) -> bytes:
+    """The bytes of a file.
+
+    Raises:
+        OSError: it cannot be read, or is no file: a pipe would be waited for, and a device has no end.
+    """
+    if not path.is_file():
+        raise OSError("not a file" if path.exists() else "not there")
+    return path.read_bytes()
+
+
+def told(error: ValidationError) -> str:
+    """The first fault that pydantic found, with its place."""
+    first = error.errors(include_url=False, include_input=False)[0]
+    where = ".".join(map(str, first["loc"]))
+    return f"{where}: {first['msg']}" if where else first["msg"]
+
+
+def _read(path: Path, form: TypeAdapter[T], faults: list[str], what: str = OURS) -> T | None:
     if not path.exists():
         return None
     try:
-        return form.validate_python(json.loads(path.read_text(encoding="utf-8")))
+        return form.validate_python(json.loads(content(path)))
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"]))
-        text = f"{where}: {first['msg']}" if where else first["msg"]
+        text = told(error)
+    except RecursionError:
+        text = "nested too deeply"
     except (OSError, ValueError) as error:
         text = str(error)
-    faults.append(f"{path.name}: not what `rhmc drawings --out` writes ({text})")
+    faults.append(f"{path.name}: not {what} ({text})")
     return None

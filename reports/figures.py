@@ -60,9 +60,9 @@ def learning_curves(results: Results, spec: Curves) -> Drawing | None:
     rulers = _rulers(results, spec)
     levels = {arm: spec.levels[arm] for arm in arms if arm in spec.levels}
     labels = _ruler_labels(rulers) + _level_labels(levels) + _curve_labels(curves, results, spec.study)
-    entries = [f"{arm} ({_seed_words(results, spec, arm)})" for arm in arms]
+    entries = ["\n".join(wrap(f"{arm} ({_seed_words(results, spec, arm)})", LEGEND)) for arm in arms]
     columns = min(5, max(1, LEGEND // (max(map(len, entries)) + 8)))
-    rows = -(-len(arms) // columns)
+    rows = -(-len(arms) // columns) + sum(entry.count("\n") for entry in entries)
     tall = max(TALL, LINE * sum(label.lines for label in labels))
     with styled():
         height = HEAD + ROW * rows + tall + FOOT
@@ -261,13 +261,13 @@ def _write_labels(axes: Axes, labels: Sequence[Label], line: float) -> None:
 
 def _legend(figure: Figure, axes: Axes, entries: Mapping[str, str], columns: int, top: float) -> None:
     """Above the axes: every planned arm with its number of seeds."""
-    for arm, text in entries.items():
+    lines = []
+    for arm in entries:
         colour, dashes = look(arm, list(entries))
-        axes.plot([], [], color=colour, linestyle=dashes, linewidth=1.9, label=text)
+        lines += axes.plot([], [], color=colour, linestyle=dashes, linewidth=1.9)
     how: dict[str, Any] = {"handlelength": 2.4, "columnspacing": 1.6, "borderpad": 0.0, "borderaxespad": 0.0}
-    figure.legend(
-        loc="upper left", bbox_to_anchor=(MARGIN, top + 0.01), ncols=columns, frameon=False, fontsize=8.5, **how
-    )
+    how |= {"loc": "upper left", "bbox_to_anchor": (MARGIN, top + 0.01), "frameon": False, "fontsize": 8.5}
+    figure.legend(lines, list(entries.values()), ncols=columns, **how)  # named here: of itself it leaves out `_c`
 
 
 def _seed_words(results: Results, spec: Curves, arm: str) -> str:

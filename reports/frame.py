@@ -1,7 +1,8 @@
-"""The exported tables, read and checked: everything a report shows comes from here.
+"""The exported tables, checked: everything a report shows comes from here.
 
 A folder holds, per study, `<study>.parquet` (one row per run, step and metric) and `<study>.runs.parquet` (one row per
-planned run). What is wrong in them is an error of one line per fault; what is not there yet is listed as missing.
+planned run); `sheets` reads them. What is wrong in them is an error of one line per fault; what is not there yet is
+listed as missing.
 """
 
 import json
@@ -16,34 +17,16 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from reports.drawn import Build, Scenes, read_modules, read_scenes
+from reports.drawn import METHOD, METHODS, Build, Scenes, content, read_methods, read_modules, read_scenes
+from reports.escape import markdown
+from reports.sheets import ASSIGNED, FORMS, MOVED, PLAYED, POINTS, RUNS, TOLD, config_fault, part, read
 from reports.stats import curve
 
-POINTS = ("study", "arm", "seed", "run", "step", "metric", "value")
-RUNS = (
-    "study",
-    "arm",
-    "seed",
-    "run",
-    "status",
-    "algorithm",
-    "task",
-    "profile",
-    "config",
-    "fingerprint",
-    "commit",
-    "question",
-    "seconds",
-)
-TOLD = ("machine", "versions")  # of a run, where they are exported
-METHOD = ("kind", "name", "source", "family", "training", "execution", "critic", "coordination")
-STATUSES = ("finished", "partial", "missing")
-METHODS = "methods.json"  # what the methods are
+__all__ = ["ASSIGNED", "METHOD", "METHODS", "MOVED", "PLAYED", "POINTS", "RUNS", "TOLD"]
+
+STATUSES = ("finished", "failed", "partial", "missing")
 EPISODES = "episode_*.gif"  # animations, one a task
 YARDSTICKS, THEOREM = "yardsticks", "theorem"  # tables that are no studies
-MOVED = "transfer"  # the table of trained policies with other numbers of agents and targets
-PLAYED = ("study", "arm", "seed", "run", "task", "agents", "targets", "trained_agents", "trained_targets", "value")
-ASSIGNED = "assignments"  # `<study>.assignments.parquet`: what the runs of a study assigned while they trained
 ASSIGN = "assign/"  # prefix of its metrics
 FINAL, CURVE = "final/return", "eval/return"
 ERRORS = ("final/return_sem", "final/coverage_sem")  # of a scripted policy; one of both is there
@@ -167,7 +150,8 @@ class Results:
         for arm, config in self.configs(study).items():
             agents = config.get("env", {}).get("agents")
             if agents is not None:
-                out.setdefault(int(agents), {})[without_count(arm, int(agents))] = arm
+                group, name = out.setdefault(int(agents), {}), without_count(arm, int(agents))
+                group[arm if name in group else name] = arm
         return dict(sorted(out.items()))
 
     def kind(self, study: str, arm: str) -> str:
@@ -209,7 +193,7 @@ class Results:
         return next((table for task, table in self.yardsticks if env and same_task(env, task)), pd.DataFrame())
 
     def gaps(self, expected: Mapping[str, Sequence[str]]) -> list[str]:
-        """What is not there, in sentences.
+        """What is not there, in sentences of Markdown; `escape.words` gives them without its marks.
 
         Args:
             expected: arms that the paper has, per study.
@@ -224,14 +208,15 @@ class Results:
             return
         for arm in arms:
             rows = self.plan(study, arm)
-            for status, words in (("missing", "not run"), ("partial", "unfinished")):
+            for status, words in (("missing", "not run"), ("partial", "unfinished"), ("failed", "failed")):
                 seeds = rows.loc[rows["status"] == status, "seed"]
                 if len(seeds):
                     listed = ", ".join(map(str, seeds))
-                    yield f"Study `{study}`, arm {arm}: {len(seeds)} of {len(rows)} seeds {words} (seed {listed})."
+                    words += f" (seed {listed})"
+                    yield f"Study `{study}`, arm {markdown(arm)}: {len(seeds)} of {len(rows)} seeds {words}."
         absent = [arm for arm in expected.get(study, ()) if arm not in arms]
         if absent:
-            yield f"Study `{study}`: no such arm yet: {', '.join(absent)}."
+            yield f"Study `{study}`: no such arm yet: {markdown(', '.join(absent))}."
         if self.yardsticks_of(study).empty:
             yield f"Study `{study}`: no scripted policies were run on this task."
 
@@ -270,7 +255,10 @@ def load(folder: Path, profile: str, only: str | None = None) -> Results:
     Raises:
         TableError: the folder holds no tables, or not those of the study, or they are faulty.
     """
-    files = sorted(folder.glob("*.parquet"))
+    try:
+        files = sorted(folder.glob("*.parquet"))
+    except OSError as error:
+        raise TableError(f"{folder}: cannot be read ({error.strerror})") from error
     if not files:
         raise TableError(f"{folder}: no tables here; `rhmc export` writes them")
     if only is not None:
@@ -278,20 +266,19 @@ def load(folder: Path, profile: str, only: str | None = None) -> Results:
     faults: list[str] = []
     tables: dict[str, list[pd.DataFrame]] = {name: [] for name in FORMS}
     for path in files:
-        part = _part(path)
-        tables[part].append(_read(path, FORMS[part], faults))
-    names = {path.name.removesuffix(".parquet") for path in files if _part(path) in ("points", "runs")}
+        tables[part(path)].append(read(path, faults))
+    names = {path.name.removesuffix(".parquet") for path in files if part(path) in ("points", "runs")}
     for name in sorted(names):
         if not name.endswith(".runs") and f"{name}.runs" not in names and name != THEOREM:
             faults.append(f"{name}.parquet: {name}.runs.parquet (the planned runs) is not beside it")
         if name.endswith(".runs") and name.removesuffix(".runs") not in names:
             faults.append(f"{name}.parquet: {name.removesuffix('.runs')}.parquet (the points) is not beside it")
-    drawn = (_methods(folder / METHODS, faults), read_modules(folder, faults), read_scenes(folder, faults))
+    drawn = (read_methods(folder, faults), read_modules(folder, faults), read_scenes(folder, faults))
     if not faults:
-        joined = {part: _join(found, FORMS[part]) for part, found in tables.items()}
+        joined = {kind: _join(found, FORMS[kind]) for kind, found in tables.items()}
         watched, moved, notes = _of_plan(joined)
         points = _join([joined["points"], watched], POINTS)
-        gifs = {path.stem.partition("_")[2]: path.read_bytes() for path in sorted(folder.glob(EPISODES))}
+        gifs = {path.stem.partition("_")[2]: _animation(path) for path in sorted(folder.glob(EPISODES))}
         results = Results(points, joined["runs"], profile, moved=moved, notes=notes)
         if only is None:
             methods, modules, scenes = drawn
@@ -314,15 +301,12 @@ def same_task(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
     return "kind" in shared and all(a[key] == b[key] for key in shared)
 
 
-FORMS: Mapping[str, tuple[str, ...]] = {"points": POINTS, "runs": RUNS, ASSIGNED: POINTS, MOVED: PLAYED}
-
-
-def _part(path: Path) -> str:
-    """Which of `FORMS` a file has."""
-    if path.name == f"{MOVED}.parquet":
-        return MOVED
-    second = path.name.removesuffix(".parquet").partition(".")[2]
-    return second if second in ("runs", ASSIGNED) else "points"
+def _animation(path: Path) -> bytes:
+    """An animation; nothing where it cannot be read, which the page says in its place."""
+    try:
+        return content(path)
+    except OSError:
+        return b""
 
 
 def _of_plan(tables: Mapping[str, pd.DataFrame]) -> tuple[pd.DataFrame, pd.DataFrame, tuple[str, ...]]:
@@ -332,8 +316,8 @@ def _of_plan(tables: Mapping[str, pd.DataFrame]) -> tuple[pd.DataFrame, pd.DataF
     """
     planned = set(zip(tables["runs"]["study"], tables["runs"]["arm"], tables["runs"]["run"], strict=True))
     kept, notes = [], []
-    for part, verb in ((ASSIGNED, "assignments"), (MOVED, "transfer")):
-        table = tables[part]
+    for kind, verb in ((ASSIGNED, "assignments"), (MOVED, "transfer")):
+        table = tables[kind]
         keys = zip(table["study"], table["arm"], table["run"], strict=True)
         there = np.array([key in planned for key in keys], dtype=bool)
         kept.append(table[there])
@@ -352,51 +336,6 @@ def _only(files: Sequence[Path], study: str, folder: Path) -> list[Path]:
     return [path for path in files if path.name.split(".")[0] in (study, YARDSTICKS)]
 
 
-def _read(path: Path, columns: Sequence[str], faults: list[str]) -> pd.DataFrame:
-    try:
-        table = pd.read_parquet(path)
-    except (OSError, ValueError):  # pyarrow's errors are among them
-        faults.append(f"{path.name}: not a readable Parquet table ({path.stat().st_size} bytes)")
-        return pd.DataFrame(columns=list(columns))
-    absent = [column for column in columns if column not in table]
-    if absent:
-        faults.append(f"{path.name}: no column {', '.join(map(repr, absent))}; there are {', '.join(table.columns)}")
-    for column in ("seed", "step", "value", "seconds", "agents", "targets"):
-        if column in table and column in columns and len(table) and not pd.api.types.is_numeric_dtype(table[column]):
-            faults.append(f"{path.name}: column {column!r} holds {table[column].dtype}, not numbers")
-    told = [column for column in TOLD if columns == RUNS and column in table]
-    return table.reindex(columns=[*columns, *told])
-
-
-def _methods(path: Path, faults: list[str]) -> list[dict[str, Any]]:
-    """The records of the methods; none without the file."""
-    if not path.exists():
-        return []
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        return [
-            {name: str(row[name]) for name in METHOD}
-            | {"actions": [str(x) for x in row["actions"]]}
-            | {
-                "parameters": [
-                    {
-                        "task": dict(x["task"]),
-                        "encoder": str(x["encoder"]),
-                        "acting": int(x["acting"]),
-                        "all": int(x["all"]),
-                    }
-                    for x in row["parameters"]
-                ]
-            }
-            for row in found
-        ]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        faults.append(
-            f"{path.name}: not the methods as `rhmc methods --out` writes them ({type(error).__name__}: {error})"
-        )
-        return []
-
-
 def _join(tables: list[pd.DataFrame], columns: Sequence[str]) -> pd.DataFrame:
     kept = [table for table in tables if len(table)]
     return pd.concat(kept, ignore_index=True) if kept else pd.DataFrame(columns=list(columns))
@@ -408,9 +347,11 @@ def _plan_faults(results: Results) -> Iterator[str]:
         yield f"{_name(row)}: status {row.status!r} is none of {', '.join(STATUSES)}"
     for row in runs[runs["profile"] != results.profile].itertuples():
         yield f"{_name(row)}: made with profile {row.profile!r}, and this report is of {results.profile!r}"
-    for row in runs.itertuples():
-        if not _config(str(row.config)):
-            yield f"{_name(row)}: column 'config' is no JSON object"
+    yield from _first(
+        f"{_name(row)}: column 'config' {fault}"
+        for row in runs.itertuples()
+        if (fault := config_fault(str(row.config)))
+    )
     studies = runs[runs["study"] != YARDSTICKS]
     for row in studies[studies.duplicated(["study", "arm", "seed"])].itertuples():
         yield f"{_name(row)}: planned twice"
@@ -474,6 +415,18 @@ def _name(row: Any) -> str:
 def _config(text: str) -> dict[str, Any]:
     try:
         found = json.loads(text)
-    except json.JSONDecodeError:
+    except (ValueError, RecursionError):
         return {}
     return found if isinstance(found, dict) else {}
+
+
+def adopted(runs: pd.DataFrame) -> bool:
+    """Whether older code made some of the runs, and trainings of the present code repeated it."""
+    return "adopted" in runs and bool(runs["adopted"].fillna("").astype(bool).any())
+
+
+def mixed(runs: pd.DataFrame) -> bool:
+    """Whether runs of one method in one task were made by different code."""
+    known = runs[runs["fingerprint"].fillna("") != ""]
+    place = ["algorithm", "task"]
+    return len(known[[*place, "fingerprint"]].drop_duplicates()) > len(known[place].drop_duplicates())

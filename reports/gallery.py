@@ -1,16 +1,24 @@
-"""Every figure of a report with its words: title, caption that says what to see, text for those who cannot see it."""
+"""Every figure of a report with its words: title, caption that says what to see, text for those who cannot see it.
 
-from collections.abc import Iterator
+A figure that cannot be drawn leaves its place, with the reason: the numbers are in the tables.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import NamedTuple
 
 from reports import beyond, comparison, diagrams, figures, scaling, scenes
 from reports.canvas import Drawing
+from reports.drawn import Counterexample, Scenes
+from reports.escape import stem
 from reports.frame import FINAL, Results
 from reports.paper import Curves, Paper
+from reports.scaling import Sweep
 from reports.tables import describe_task, joined, number, steps
 
 PAPERS = "fig_"
 OWN = ("RHMC", "full")  # the paper's method
+Made = tuple[str, str, Drawing]  # caption, text for those who cannot see it, figure
 
 
 class Picture(NamedTuple):
@@ -20,9 +28,10 @@ class Picture(NamedTuple):
     title: str
     caption: str
     alt: str
-    drawing: Drawing
+    drawing: Drawing | None
     study: str = ""
     behind: str = ""  # the command that made its numbers, where it is not the study's own
+    fault: str = ""  # why it could not be drawn
 
     @property
     def heading(self) -> str:
@@ -31,13 +40,31 @@ class Picture(NamedTuple):
         return f"Fig. {own}. {self.title}" if self.name.startswith(PAPERS) and own.isdigit() else self.title
 
 
+def reason(error: Exception) -> str:
+    """What went wrong with a figure, on one line."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}".removesuffix(": ")
+
+
+def picture(
+    name: str, title: str, make: Callable[[], Made | None], study: str = "", behind: str = ""
+) -> Iterator[Picture]:
+    """The figure that `make` draws, none if that has no data for it, or its place if it fails."""
+    try:
+        made = make()
+    except Exception as error:
+        yield Picture(name, title, "", "", None, study, behind, reason(error))
+    else:
+        if made:
+            yield Picture(name, title, *made, study, behind)
+
+
 def gallery(results: Results, paper: Paper) -> list[Picture]:
     """The paper's figures in their order, then what goes beyond it. What has no data is left out."""
     drawn = [*_networks(results), *_states(results), *_scaling(results), *_counterexamples(results)]
     known = {spec.study: name for name, spec in paper.figures.items()}
     for study in results.studies:
         spec = paper.figures[known[study]] if study in known else paper.curves_of(study, results.task(study))
-        drawn += _curves(results, spec, known.get(study, f"curves_{study}"))
+        drawn += _curves(results, spec, known.get(study, f"curves_{stem(study)}"))
     own = sorted((p for p in drawn if p.name.startswith(PAPERS)), key=lambda p: _order(p.name))
     return own + [p for p in drawn if not p.name.startswith(PAPERS)] + list(comparisons(results))
 
@@ -64,8 +91,8 @@ def study_gallery(results: Results, paper: Paper, study: str) -> list[Picture]:
     """The figures of one study."""
     spec = paper.curves_of(study, results.task(study))
     return [
-        *_curves(results, spec, f"curves_{study}"),
-        *_sweep(results, study, f"scaling_{study}"),
+        *_curves(results, spec, f"curves_{stem(study)}"),
+        *_sweep(results, study, f"scaling_{stem(study)}"),
         *comparisons(results),
     ]
 
@@ -73,36 +100,51 @@ def study_gallery(results: Results, paper: Paper, study: str) -> list[Picture]:
 def comparisons(results: Results) -> Iterator[Picture]:
     """What the paper does not have: assignments, performance profiles, probabilities of improvement, transfer."""
     for study in results.studies:
-        watched = beyond.fig_assignments(results, study)
-        if watched:
-            title = f"What is assigned while training, study {study}"
-            caption = (
-                "The mechanism behind the ablation: see whether pairs grow fewer, whether two agents are sent to one "
-                "target ever less often, and whether targets are left to nobody."
-            )
-            alt = f"Three line charts against environment steps for {joined(beyond.assigning(results, study))}."
-            made = f"rhmc assignments studies/{study.partition('@')[0]}.yaml --profile {results.profile}"
-            yield Picture(f"assignments_{study}", title, caption, alt, watched, study, made)
-        arms = comparison.compared(results, study)
-        profile = comparison.profile(results, study)
-        if profile:
-            title = f"Performance profile, study {study}"
-            caption = "See which line stays furthest right: that arm's seeds end highest, whatever score one asks for."
-            yield Picture(f"profile_{study}", title, caption, f"Step chart for {joined(arms)}.", profile, study)
-        matrix = comparison.matrix(results, study)
-        if matrix:
-            title = f"Probability of improvement, study {study}"
-            caption = f"Rows are sorted by mean: the bluer the row, the more often it wins. On top: {arms[0]}."
-            alt = f"Matrix of the probability that a seed of one arm beats one of another, for {joined(arms)}."
-            yield Picture(f"better_{study}", title, caption, alt, matrix, study)
+        made = f"rhmc assignments studies/{study.partition('@')[0]}.yaml --profile {results.profile}"
+        title = f"What is assigned while training, study {study}"
+        name = stem(study)
+        yield from picture(f"assignments_{name}", title, partial(_assigned, results, study), study, made)
+        title = f"Performance profile, study {study}"
+        yield from picture(f"profile_{name}", title, partial(_profile, results, study), study)
+        title = f"Probability of improvement, study {study}"
+        yield from picture(f"better_{name}", title, partial(_better, results, study), study)
+    title = "Trained once, played with other numbers"
+    yield from picture("transfer", title, lambda: _moved(results), "-", "rhmc transfer")
+
+
+def _assigned(results: Results, study: str) -> Made | None:
+    watched = beyond.fig_assignments(results, study)
+    caption = (
+        "The mechanism behind the ablation: see whether pairs grow fewer, whether two agents are sent to one "
+        "target ever less often, and whether targets are left to nobody."
+    )
+    alt = f"Three line charts against environment steps for {joined(beyond.assigning(results, study))}."
+    return (caption, alt, watched) if watched else None
+
+
+def _profile(results: Results, study: str) -> Made | None:
+    profile = comparison.profile(results, study)
+    caption = "See which line stays furthest right: that arm's seeds end highest, whatever score one asks for."
+    alt = f"Step chart for {joined(comparison.compared(results, study))}."
+    return (caption, alt, profile) if profile else None
+
+
+def _better(results: Results, study: str) -> Made | None:
+    matrix, arms = comparison.matrix(results, study), comparison.compared(results, study)
+    if matrix is None:
+        return None
+    caption = f"Rows are sorted by mean: the bluer the row, the more often it wins. On top: {arms[0]}."
+    alt = f"Matrix of the probability that a seed of one arm beats one of another, for {joined(arms)}."
+    return caption, alt, matrix
+
+
+def _moved(results: Results) -> Made | None:
     moved = beyond.fig_transfer(results)
-    if moved:
-        caption = (
-            "No step of training with the other numbers: see how far a policy follows the planner as sensors or "
-            "targets are added, and where it falls below sensors that each seek their own best window."
-        )
-        alt = "Two line charts of return against numbers of sensors and of targets."
-        yield Picture("transfer", "Trained once, played with other numbers", caption, alt, moved, "-", "rhmc transfer")
+    caption = (
+        "No step of training with the other numbers: see how far a policy follows the planner as sensors or "
+        "targets are added, and where it falls below sensors that each seek their own best window."
+    )
+    return (caption, "Two line charts of return against numbers of sensors and of targets.", moved) if moved else None
 
 
 def curve_caption(results: Results, study: str) -> str:
@@ -128,23 +170,26 @@ def _against_scripts(results: Results, study: str, means: dict[str, float]) -> s
 
 
 def _curves(results: Results, spec: Curves, name: str) -> Iterator[Picture]:
-    whole = figures.learning_curves(results, spec)
-    if whole is None:
-        return
-    finals = [
-        f"{arm} {number(float(x.mean()))}"
-        for arm in results.arms(spec.study)
-        if len(x := results.finals(spec.study, arm))
-    ]
-    alt = f"Line chart of return against environment steps, {describe_task(results.env(spec.study))}. "
-    alt += f"Final returns: {', '.join(finals)}." if finals else "No run is finished."
-    yield Picture(name, spec.title, curve_caption(results, spec.study), alt, whole, spec.study)
-    each = figures.each_arm(results, spec)
-    if each:
+    """All arms in one frame, and where they are many each in a frame of its own."""
+
+    def whole() -> Made | None:
+        drawing = figures.learning_curves(results, spec)
+        return (curve_caption(results, spec.study), _finals(results, spec.study), drawing) if drawing else None
+
+    def each() -> Made | None:
+        drawing = figures.each_arm(results, spec)
         caption = "The same curves one by one: see the width of each band, and where a curve bends down again."
-        yield Picture(
-            f"{name}_arms", f"{spec.title}, arm by arm", caption, f"Small line charts. {alt}", each, spec.study
-        )
+        return (caption, f"Small line charts. {_finals(results, spec.study)}", drawing) if drawing else None
+
+    yield from picture(name, spec.title, whole, spec.study)
+    yield from picture(f"{name}_arms", f"{spec.title}, arm by arm", each, spec.study)
+
+
+def _finals(results: Results, study: str) -> str:
+    """The curves of a study in words."""
+    finals = [f"{arm} {number(float(x.mean()))}" for arm in results.arms(study) if len(x := results.finals(study, arm))]
+    words = f"Line chart of return against environment steps, {describe_task(results.env(study))}. "
+    return words + (f"Final returns: {', '.join(finals)}." if finals else "No run is finished.")
 
 
 def _networks(results: Results) -> Iterator[Picture]:
@@ -154,48 +199,58 @@ def _networks(results: Results) -> Iterator[Picture]:
     sizes = "; ".join(f"{n.role}, {b.encoder}: {n.parameters:,}" for b in builds for n in b.networks)
     alt = f"Diagram of RHMC's networks. Parameters: {sizes}."
     caption = "Two levels and what runs between them: see how small the networks are, and that the critics see more."
-    yield Picture("fig_1", "Architecture of RHMC", caption, alt, diagrams.architecture(builds))
+    yield from picture("fig_1", "Architecture of RHMC", lambda: (caption, alt, diagrams.architecture(builds)))
     for name, role, level in (("fig_2", "coordinator", "High"), ("fig_3", "executor", "Low")):
         title = f"{level} level: the {role}{'s' if role == 'executor' else ''}, layer by layer"
-        caption = (
-            "Every layer as it ran: the fully connected reading above, the pairwise one below, which pools over pairs."
-        )
-        yield Picture(
-            name, title, caption, f"Diagram of the {role}'s layers. {alt}", diagrams.level(builds, role, title)
-        )
+
+        def layers(role: str = role, title: str = title) -> Made:
+            words = "Every layer as it ran: the fully connected reading above, the pairwise one below, which pools over"
+            return f"{words} pairs.", f"Diagram of the {role}'s layers. {alt}", diagrams.level(builds, role, title)
+
+        yield from picture(name, title, layers)
 
 
 def _states(results: Results) -> Iterator[Picture]:
     found = results.scenes
     if found is None:
         return
+    title = "Regulation: Algorithm 1 on a real instance"
+    yield from picture("fig_4", title, lambda: _regulation(found))
+    caption = "An episode's first and last state. The task is done when every cross lies under an agent of its own."
+    alt = "Two plots of agents and landmarks in the plane, before and after an episode."
+    yield from picture("fig_5", "Cooperative navigation", lambda: (caption, alt, scenes.navigation(found.navigation)))
+    title = "Sensor coverage with different numbers of sensors"
+    yield from picture("fig_8", title, lambda: _sensors(found))
+
+
+def _regulation(found: Scenes) -> Made:
     ours, best = found.regulation.paths.algorithm_1.reward, found.regulation.paths.optimum.reward
     caption = (
         f"A column is an agent, a box one of its options. Algorithm 1 settles on {number(ours, 2)} (orange) where "
         f"{number(best, 2)} was to be had (blue): it keeps one set of targets per option, chosen by count."
     )
     alt = f"Graph of options by agent with two paths: Algorithm 1, reward {number(ours, 2)}; optimum {number(best, 2)}."
-    yield Picture(
-        "fig_4", "Regulation: Algorithm 1 on a real instance", caption, alt, scenes.regulation(found.regulation)
-    )
-    caption = "An episode's first and last state. The task is done when every cross lies under an agent of its own."
-    alt = "Two plots of agents and landmarks in the plane, before and after an episode."
-    yield Picture("fig_5", "Cooperative navigation", caption, alt, scenes.navigation(found.navigation))
+    return caption, alt, scenes.regulation(found.regulation)
+
+
+def _sensors(found: Scenes) -> Made:
     seen = ", ".join(f"{scenes.covered(s)} of {len(s.targets)} with {s.agents}" for s in found.coverage)
     caption = (
         "Five targets and more and more sensors, each case an episode of its own: see how far apart they stand, how "
         "little a sector of 90 degrees takes in, and how sectors begin to overlap."
     )
     alt = f"Plots of sensors with their sectors of view and targets. Targets seen: {seen} sensors."
-    yield Picture(
-        "fig_8", "Sensor coverage with different numbers of sensors", caption, alt, scenes.coverage(found.coverage)
-    )
+    return caption, alt, scenes.coverage(found.coverage)
 
 
 def _counterexamples(results: Results) -> Iterator[Picture]:
     found = results.scenes.counterexamples if results.scenes else ()
-    if not found:
-        return
+    if found:
+        title = "Theorem 1: the smallest counterexamples"
+        yield from picture("counterexamples", title, lambda: _missed(found), "-", "rhmc drawings")
+
+
+def _missed(found: Sequence[Counterexample]) -> Made:
     rewards = [(number(case.paths.algorithm_1.reward, 2), number(case.paths.optimum.reward, 2)) for case in found]
     caption = (
         "Theorem 1 says that Algorithm 1 finds the largest reward. See where the orange way, which keeps the first of "
@@ -204,8 +259,7 @@ def _counterexamples(results: Results) -> Iterator[Picture]:
     alt = "Graphs of options by agent with two paths: " + "; ".join(
         f"Algorithm 1, reward {ours}, optimum {best}" for ours, best in rewards
     )
-    title = "Theorem 1: the smallest counterexamples"
-    yield Picture("counterexamples", title, caption, f"{alt}.", scenes.counterexamples(found), "-", "rhmc drawings")
+    return caption, f"{alt}.", scenes.counterexamples(found)
 
 
 def _scaling(results: Results) -> Iterator[Picture]:
@@ -214,13 +268,17 @@ def _scaling(results: Results) -> Iterator[Picture]:
 
 def _sweep(results: Results, study: str, name: str) -> Iterator[Picture]:
     found = scaling.sweep(results, study)
-    drawing = scaling.figure(results, found) if found else None
-    if found and drawing:
-        caption = (
-            "See whether one line stays on top at every number of agents, and whether it ever falls as they are added."
-        )
-        alt = f"Line chart of final return against {joined(map(str, found.counts))} agents for {joined(found.arms)}."
-        yield Picture(name, "Final return by number of agents", caption, alt, drawing, study)
+    if found:
+        yield from picture(name, "Final return by number of agents", lambda: _by_agents(results, found), study)
+
+
+def _by_agents(results: Results, found: Sweep) -> Made | None:
+    drawing = scaling.figure(results, found)
+    caption = (
+        "See whether one line stays on top at every number of agents, and whether it ever falls as they are added."
+    )
+    alt = f"Line chart of final return against {joined(map(str, found.counts))} agents for {joined(found.arms)}."
+    return (caption, alt, drawing) if drawing else None
 
 
 def _order(name: str) -> tuple[int, str]:

@@ -10,7 +10,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from reports.claims import JUDGED, VERDICTS, Claim, described
-from reports.frame import TOLD, Results
+from reports.escape import stem
+from reports.frame import TOLD, Results, adopted
 from reports.gallery import Picture
 from reports.tables import NONE, Table
 
@@ -66,6 +67,7 @@ class Plate(NamedTuple):
     shown: int  # pixels of the page that it takes, if there is room
     behind: str
     files: list[tuple[str, str]]
+    fault: str = ""  # why there is nothing to see
 
 
 class Section(NamedTuple):
@@ -91,24 +93,36 @@ def render(content: Mapping[str, Any]) -> str:
     """The page. content: see `page.html.j2`; a name that is missing there is an error."""
     folder = FileSystemLoader(Path(__file__).parent)
     env = Environment(loader=folder, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    env.filters["stem"] = stem
     return env.get_template(TEMPLATE).render(content)
 
 
 def plate(picture: Picture, folder: Path, behind: str) -> Plate:
-    """A figure from its PNG in a folder. behind: the command that made its numbers."""
+    """A figure from its PNG in a folder, or its place. behind: the command that made its numbers."""
+    kinds = {"PDF": "pdf", "numbers": "csv"}
+    names = {word: f"{picture.name}.{kind}" for word, kind in kinds.items()}
+    files = [(word, f"figures/{name}") for word, name in names.items() if (folder / name).exists()]
+    if picture.fault:
+        about = (picture.name, picture.heading, picture.caption, "", "", "")
+        return Plate(*about, 0, 0, 0, behind, files, picture.fault)
     data = (folder / f"{picture.name}.png").read_bytes()
     width, height = int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")  # of the PNG's header
-    files = [("PDF", f"figures/{picture.name}.pdf"), ("numbers", f"figures/{picture.name}.csv")]
     about = (picture.name, picture.heading, picture.caption, picture.alt, "png", b64encode(data).decode())
     return Plate(*about, width, height, round(width * SHOWN), behind, files)
 
 
 def episode(task: str, gif: bytes) -> Plate:
-    """An animation from what `rhmc render` wrote."""
+    """An animation from what `rhmc render` wrote, or its place."""
     width, height = int.from_bytes(gif[6:8], "little"), int.from_bytes(gif[8:10], "little")  # of the GIF's header
     words = EPISODE_WORDS.get(task, "A trained policy, and others in the same episode.")
-    about = (f"episode_{task}", f"An episode of {task}", words, words, "gif", b64encode(gif).decode())
-    return Plate(*about, width, height, width, "rhmc render", [])
+    about = (f"episode_{stem(task)}", f"An episode of {task}", words, words, "gif", b64encode(gif).decode())
+    return Plate(*about, width, height, width, "rhmc render", [], animation_fault(gif))
+
+
+def animation_fault(gif: bytes) -> str:
+    """Why a file is no animation; nothing if it is one."""
+    whole = gif[:6] in (b"GIF87a", b"GIF89a") and gif[-1:] == b";" and any(gif[6:8]) and any(gif[8:10])
+    return "" if whole else f"the file is not a whole GIF ({len(gif)} bytes)"
 
 
 def grid(name: str, table: Table, *, files: bool = True) -> Grid:
@@ -119,8 +133,8 @@ def grid(name: str, table: Table, *, files: bool = True) -> Grid:
 
 
 def cell(text: str) -> Cell:
-    """Words with `<br>` kept and all else escaped; sorted as a number if they begin with one, and empty last."""
-    words = Markup("<br>").join(escape(part) for part in text.split("<br>"))
+    """Words with new lines kept and all else escaped; sorted as a number if they begin with one, and empty last."""
+    words = Markup("<br>").join(escape(part) for part in text.splitlines())
     return Cell(words, sort_key(text))
 
 
@@ -157,8 +171,10 @@ def provenance(results: Results) -> list[tuple[str, str]]:
     runs = results.runs
     known = sorted(set(runs["fingerprint"].dropna().astype(str)) - {""})
     seconds = float(runs["seconds"].fillna(0).sum())
-    found = [("Profile", results.profile), ("Code fingerprint", ", ".join(known) or "unknown")]
+    found = [("Profile", results.profile), ("Code", ", ".join(known) or "unknown")]
     for name in TOLD:
+        if name == "adopted" and not adopted(runs):
+            continue
         values = sorted(set(runs[name].dropna().astype(str)) - {""}) if name in runs else []
         found.append((name.capitalize(), "; ".join(values) or "not exported"))
     return [*found, ("Processor time of all runs", duration(seconds))]

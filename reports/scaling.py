@@ -1,6 +1,7 @@
 """Figure 9: final return against the number of agents, for every method of a study that has several such numbers."""
 
 from collections.abc import Mapping
+from textwrap import wrap
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from reports.stats import FEW, Interval, interval
 from reports.tables import NONE, Table, estimate, number, readable, seeds, steps
 
 STUDY = "scaling"
+LETTERS = 34  # of a name on a line beside the axes
 
 
 class Sweep(NamedTuple):
@@ -123,7 +125,7 @@ def _draw(axes: Axes, method: str, values: Mapping[int, Interval], methods: list
     for n, x in values.items():
         if np.isfinite(x.low):
             axes.plot([n, n], [x.low, x.high], color=colour, linewidth=1.2, alpha=0.6, zorder=3)
-    return means[-1], f"{method} {number(means[-1])}", colour
+    return means[-1], "\n".join(wrap(f"{method} {number(means[-1])}", LETTERS)), colour
 
 
 def _draw_ruler(axes: Axes, name: str, values: Mapping[int, float]) -> tuple[float, str, str]:

@@ -7,7 +7,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from reports.frame import FINAL, METHOD, TOLD, Results
+from reports.escape import latex, line, markdown
+from reports.frame import FINAL, METHOD, TOLD, Results, adopted
 from reports.paper import Paper
 from reports.stats import LEVEL, Interval, change, improvement, interval, iqm
 
@@ -15,23 +16,28 @@ NONE = "–"  # where there is nothing to show
 
 
 class Table(NamedTuple):
-    """A table twice: `numbers` with full digits, one quantity a column; `shown` as text, for people."""
+    """A table twice: `numbers` with full digits, one quantity a column; `shown` as text, for people.
+
+    Words stand as they were typed, and what writes a table escapes them; a new line in a cell is one on paper.
+    """
 
     title: str
     numbers: pd.DataFrame
     shown: pd.DataFrame
     note: str = ""  # what a reader has to know
+    marked: bool = False  # whether the cells are Markdown already
 
     def markdown(self) -> str:
         """As a Markdown table."""
-        rows = [self.shown.columns, ["---"] * self.shown.shape[1], *self.shown.to_numpy(str)]
-        return "\n".join(f"| {' | '.join(str(cell).replace('|', '/') for cell in row)} |" for row in rows)
+        write = str if self.marked else _markdown_cell
+        body = [[write(str(cell)) for cell in row] for row in self.shown.to_numpy(object)]
+        heads = [_markdown_cell(str(name)) for name in self.shown.columns]
+        return "\n".join(f"| {' | '.join(row)} |" for row in [heads, ["---"] * len(heads), *body])
 
     def latex(self) -> str:
         """As a LaTeX table (packages: booktabs)."""
-        plain = self.shown.map(lambda text: str(text).replace(NONE, "--"))
-        body = plain.rename(columns=_escape).map(_escape)
-        return body.to_latex(index=False, column_format="l" + "r" * (body.shape[1] - 1), caption=_escape(self.title))
+        body, title = self.shown.map(_latex_cell).rename(columns=_latex_cell), _latex_cell(self.title)
+        return body.to_latex(index=False, column_format="l" + "r" * (body.shape[1] - 1), caption=title)
 
 
 def table_1(results: Results) -> Table:
@@ -209,14 +215,17 @@ def provenance(results: Results) -> Table:
             {
                 "Study": str(study),
                 "Finished": f"{done} of {len(rows)}",
-                "Code": "<br>".join(known["fingerprint"]) or NONE,
-                "Commit": "<br>".join(_short(commit) for commit in known["commit"]) or NONE,
-                "Machine": "<br>".join(known["machine"]) or NONE,
-                "Versions": "<br>".join(known["versions"]) or NONE,
+                "Code": "\n".join(map(line, known["fingerprint"])) or NONE,
+                "Commit": "\n".join(line(_short(commit)) for commit in known["commit"]) or NONE,
+                "Machine": "\n".join(map(line, known["machine"])) or NONE,
+                "Versions": "\n".join(map(line, known["versions"])) or NONE,
+                **({"Adopted": "\n".join(map(line, known["adopted"])) or NONE} if adopted(results.runs) else {}),
                 "Processor time": f"{number(seconds / 60)} min" if seconds else NONE,
             }
         )
-    note = "Code: fingerprint of what decides results. A commit with + had changes that were not committed."
+    note = "Code: one name for each method in each task. A commit with + had changes that were not committed."
+    if adopted(results.runs):
+        note += " Adopted: made by older code, and repeated bit for bit by what is named there."
     return Table("What made the runs", pd.DataFrame(numbers), pd.DataFrame(shown), note)
 
 
@@ -318,10 +327,12 @@ def _mean(values: NDArray[np.float64]) -> float:
     return float(values.mean()) if len(values) else -np.inf
 
 
-def _escape(text: str) -> str:
-    for sign in "%&_#":
-        text = text.replace(sign, "\\" + sign)
-    return text.replace("−", "$-$").replace("<", "$<$").replace(">", "$>$")
+def _markdown_cell(text: str) -> str:
+    return "<br>".join(map(markdown, text.splitlines()))
+
+
+def _latex_cell(text: object) -> str:
+    return latex("; ".join(str(text).splitlines())).replace(NONE, "--")
 
 
 def joined(names: Iterable[str]) -> str:

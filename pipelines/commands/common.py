@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipelines.errors import InputError
+from pipelines.errors import InputError, visible, visible_lines
+from pipelines.names import PROFILES
 
 if TYPE_CHECKING:
     from pipelines.study import Study
@@ -37,7 +38,7 @@ def _studies(incomplete: str) -> list[str]:
 
 
 def _profiles(incomplete: str) -> list[str]:
-    return [name for name in ("quick", "paper") if name.startswith(incomplete)]
+    return [name for name in PROFILES if name.startswith(incomplete)]
 
 
 File = Annotated[
@@ -75,9 +76,9 @@ def load_studies(
         try:
             studies.append(load_study(file, profile, overrides, variant))
         except InputError as error:
-            faults[file] = str(error).splitlines()
+            faults[file] = [str(line) for line in error.args]
     if faults:
-        raise InputError("\n".join(_of_files(faults, len(set(files)))))
+        raise InputError(*_of_files(faults, len(set(files))))
     return studies
 
 
@@ -110,26 +111,40 @@ def folder_option(out: Path | None) -> Iterator[None]:
         raise InputError(str(error)) from error
 
 
+def profile_faults(profile: str) -> list[str]:
+    """What is wrong with `--profile`, for verbs that read no study."""
+    from pipelines.document import choices, show
+
+    return [] if profile in PROFILES else [f"--profile: {show(profile)} is not allowed; {choices(profile, PROFILES)}"]
+
+
 def say(text: str) -> None:
-    """A line on stdout, at once."""
-    print(text, flush=True)
+    """Lines on stdout, at once."""
+    print(visible_lines(text), flush=True)
+
+
+def tell(text: str) -> None:
+    """A line on stderr, at once."""
+    print(visible(text), file=sys.stderr, flush=True)
 
 
 def say_json(value: Any) -> None:
-    """One JSON value on stdout, on a line of its own."""
-    print(json.dumps(value, ensure_ascii=False), flush=True)
+    """One JSON value on stdout, on a line of its own; what cannot be seen stays as JSON's escapes."""
+    text = json.dumps(value, ensure_ascii=False)
+    print(text if visible(text) == text else json.dumps(value), flush=True)
 
 
 def table(columns: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[str] = ()) -> None:
     """A table on stdout; `numbers` are the columns that stand to the right."""
     from rich import box
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
+    from pipelines.terminal import terminal
+
     drawn = Table(box=box.SIMPLE)
     for column in columns:
-        drawn.add_column(column, justify="right" if column in numbers else "left", overflow="fold")
+        drawn.add_column(Text(column), justify="right" if column in numbers else "left", overflow="fold")
     for row in rows:
-        drawn.add_row(*map(Text, row))
-    Console(width=None if sys.stdout.isatty() else WIDTH).print(drawn)
+        drawn.add_row(*(Text(visible(cell)) for cell in row))
+    terminal(None if sys.stdout.isatty() else WIDTH).print(drawn)

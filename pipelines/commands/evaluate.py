@@ -1,13 +1,24 @@
 """Trained policies looked at again: on a bank of episodes, with other numbers of agents, and what they assign."""
 
-import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from pipelines.commands.common import File, Json, Profile, Sets, Variant, folder_option, load_study, say_json, table
+from pipelines.commands.common import (
+    File,
+    Json,
+    Profile,
+    Sets,
+    Variant,
+    folder_option,
+    load_study,
+    say_json,
+    table,
+    tell,
+)
 from pipelines.errors import InputError
+from pipelines.limits import BOUNDS, EPISODES, JOBS, SEED
 
 CHECKPOINT = ".pt"
 Arms = Annotated[list[str] | None, typer.Option(help="Only this arm. Can be given several times.")]
@@ -23,9 +34,11 @@ def evaluate(
     seed: Seeds = None,
     agents: Annotated[int | None, typer.Option(help="Other than the policy was trained with.")] = None,
     targets: Annotated[int | None, typer.Option(help="Other than the policy was trained with.")] = None,
-    episodes: Annotated[int | None, typer.Option(min=2, help="Of the bank; the run's final bank if not given.")] = None,
+    episodes: Annotated[
+        int | None, typer.Option(min=2, max=EPISODES, help="Of the bank; the run's final bank if not given.")
+    ] = None,
     bank: Annotated[
-        int | None, typer.Option(min=0, help="Seed of the bank; the run's final bank if not given.")
+        int | None, typer.Option(min=0, max=SEED, help="Seed of the bank; the run's final bank if not given.")
     ] = None,
     config: Annotated[
         Path | None, typer.Option(help="Settings of a .pt file, other than it names itself: a config.yaml.")
@@ -71,8 +84,8 @@ def transfer(
     targets: Annotated[str, typer.Option(metavar="M,M", help="Numbers of targets, with the trained agents.")] = "",
     arm: Arms = None,
     seed: Seeds = None,
-    episodes: Annotated[int, typer.Option(min=2, help="Of each bank.")] = 200,
-    jobs: Annotated[int, typer.Option(min=1, help="Policies at a time.")] = 2,
+    episodes: Annotated[int, typer.Option(min=2, max=EPISODES, help="Of each bank.")] = 200,
+    jobs: Annotated[int, typer.Option(min=1, max=JOBS, help="Policies at a time.")] = 2,
 ) -> None:
     """Play a study's trained policies with other numbers of agents and targets, and write transfer.parquet.
 
@@ -97,7 +110,7 @@ def transfer(
             [str(x) for x in row[1:3]] + [f"{row[5]} x {row[6]}", f"{row[10]:.2f} ± {row[11]:.2f}"] for row in rows
         ]
         table(["arm", "seed", "agents x targets", "return"], shown, numbers=["seed", "return"])
-        print(f"wrote {export_transfer(rows, out)}", file=sys.stderr)
+        tell(f"wrote {export_transfer(rows, out)}")
 
 
 def assignments(
@@ -107,7 +120,7 @@ def assignments(
     variant: Variant = None,
     arm: Arms = None,
     seed: Seeds = None,
-    jobs: Annotated[int, typer.Option(min=1, help="Runs at a time.")] = 2,
+    jobs: Annotated[int, typer.Option(min=1, max=JOBS, help="Runs at a time.")] = 2,
     overrides: Sets = None,
 ) -> None:
     """Train a study's coordinators again and watch what they assign: <study>.assignments.parquet.
@@ -125,7 +138,7 @@ def assignments(
             last = run.points[-1][1]
             cells = [run.item.card.arm, str(run.item.card.seed), *(f"{last[PREFIX + name]:.4f}" for name in columns)]
             table(["arm", "seed", *columns], [cells], numbers=["seed", *columns])
-            print(f"wrote {written}", file=sys.stderr)
+            tell(f"wrote {written}")
 
 
 def _counts(option: str, text: str) -> list[int]:
@@ -134,8 +147,8 @@ def _counts(option: str, text: str) -> list[int]:
         found = [int(part) for part in text.split(",")] if text.strip() else []
     except ValueError as error:
         raise InputError(f"--{option}: {text!r}: whole numbers with commas between, such as 2,3,6") from error
-    if any(n < 1 for n in found):
-        raise InputError(f"--{option}: {text!r}: numbers from 1 on")
+    if any(not 1 <= n <= BOUNDS[option] for n in found):
+        raise InputError(f"--{option}: {text!r}: numbers from 1 to {BOUNDS[option]}")
     return found
 
 

@@ -1,12 +1,11 @@
 """The command `rhmc render`."""
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipelines.commands.common import Profile, Variant
+from pipelines.commands.common import Profile, Variant, tell
 
 if TYPE_CHECKING:
     from pipelines.policy import Saved
@@ -41,7 +40,7 @@ def render(
     if out.suffix.lower() != ".gif":
         raise InputError(f"--out: {out} must end in .gif")
     saved = _of_study(Path(what), profile, variant, arm, seed) if what.endswith(STUDY) else None
-    print(f"wrote {draw(saved or what, out, Home(work_folder()), episode, beside, frames)}", file=sys.stderr)
+    tell(f"wrote {draw(saved or what, out, Home(work_folder()), episode, beside, frames)}")
 
 
 def _of_study(file: Path, profile: str, variant: str | None, arm: str | None, seed: int | None) -> "Saved":

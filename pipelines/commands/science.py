@@ -1,18 +1,22 @@
 """Verbs that describe the code: Theorem 1, the methods, the fingerprint; and the report from what was exported."""
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from pipelines.commands.common import Profile, folder_option, table
-from pipelines.errors import InputError
+from pipelines.commands.common import Profile, folder_option, profile_faults, say, table, tell
+from pipelines.errors import InputError, visible_lines
+from pipelines.files import fault_of, regular
+from pipelines.limits import EPISODES, SEED
+from pipelines.names import PROFILES, fault_of_study, simple, study_name
 
 
 def theorem(
-    instances: Annotated[int, typer.Option(min=1, help="Random instances per size and density.")] = 20_000,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    instances: Annotated[
+        int, typer.Option(min=1, max=EPISODES, help="Random instances per size and density.")
+    ] = 20_000,
+    seed: Annotated[int, typer.Option(min=0, max=SEED)] = 0,
     alpha: Annotated[float, typer.Option(min=0, max=1, help="The penalty of Eq. 6.")] = 0.1,
     out: Annotated[Path | None, typer.Option(help="Also write theorem.parquet in this folder.")] = None,
 ) -> None:
@@ -24,7 +28,7 @@ def theorem(
         found = shortfall_table(instances, seed, alpha=alpha)
         print(summary(found, alpha))
         if out is not None:
-            print(f"wrote {export_theorem(found, seed, out)}", file=sys.stderr)
+            tell(f"wrote {export_theorem(found, seed, out)}")
 
 
 def methods(out: Annotated[Path | None, typer.Option(help="Also write methods.json in this folder.")] = None) -> None:
@@ -41,7 +45,7 @@ def methods(out: Annotated[Path | None, typer.Option(help="Also write methods.js
         counted = [f"{size['task']['kind']}, {size['encoder']}" for size in found[0]["parameters"]]
         table(["method", "source", "family", "training", "execution", "actions", *counted], rows, numbers=counted)
         if out is not None:
-            print(f"wrote {export_methods(out)}", file=sys.stderr)
+            tell(f"wrote {export_methods(out)}")
 
 
 def fingerprint(file: Annotated[Path | None, typer.Argument(help="Write it there, if it differs.")] = None) -> None:
@@ -53,10 +57,27 @@ def fingerprint(file: Annotated[Path | None, typer.Argument(help="Write it there
         print(text, end="")
         return
     try:
-        if not file.exists() or file.read_text() != text:
-            file.write_text(text)
+        if not file.exists() or regular(file).read_bytes() != text.encode():
+            file.write_text(text, encoding="utf-8")
     except OSError as error:
         raise InputError(f"{file}: cannot be written ({error.strerror})") from error
+
+
+def profile(
+    file: Annotated[Path, typer.Argument(help="Where it stands, as `profile: quick`.")] = Path("params.yaml"),
+) -> None:
+    """Print the profile that the pipeline runs on, or say why there is none: its name goes into paths and commands."""
+    from pipelines.document import choices, read, show
+
+    root, faults = read(file)
+    written = root.children.get("profile") if root else None
+    if faults:
+        raise InputError(*map(str, faults))
+    if written is None:
+        raise InputError(f"{file}: profile: missing; {choices('', PROFILES)}")
+    if written.value not in PROFILES:
+        raise InputError(f"{written.place}: profile: {show(written.value)} is not allowed; {choices('', PROFILES)}")
+    say(str(written.value))
 
 
 def drawings(
@@ -67,7 +88,7 @@ def drawings(
 
     with folder_option(out):
         for file in export_drawings(out):
-            print(f"wrote {file}", file=sys.stderr)
+            tell(f"wrote {file}")
 
 
 def report(
@@ -81,14 +102,20 @@ def report(
     ] = None,
 ) -> None:
     """Build figures, tables, claims and their page from the exported tables; or curves and comparison of one study."""
-    if study is not None and not study.is_file():
-        raise InputError(f"--study: {study} is not a file; a study such as studies/ablation.yaml")
+    if faults := profile_faults(profile):
+        raise InputError(*faults)
+    if study is not None and (fault := fault_of(study)):
+        raise InputError(f"--study: {study}: {fault}; a study such as studies/ablation.yaml")
     if variant is not None and study is None:
         raise InputError("--variant: belongs to a study; give --study as well")
+    if study is not None and (fault := fault_of_study(study_name(study))):
+        raise InputError(f"--study: {study}: {fault}")
+    if variant is not None and not simple(variant):
+        raise InputError(f"--variant: {variant!r} is not allowed; letters, digits, '-' and '_' only")
     from reports.build import main as build
 
     arguments = ["--profile", profile]
-    arguments += ["--study", f"{study.stem}@{variant}" if variant else study.stem] if study else []
+    arguments += ["--study", study_name(study, variant or "")] if study else []
     arguments += ["--runs", str(runs)] if runs else []
     arguments += ["--out", str(out)] if out else []
-    raise typer.Exit(build(arguments))
+    raise typer.Exit(build(arguments, visible_lines))

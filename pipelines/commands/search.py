@@ -44,6 +44,8 @@ def check(file: File, profile: Profile = "quick", overrides: Sets = None) -> Non
         f"{each * search.steps:,} in all; sampler {search.sampler.kind}, pruner {search.pruner.kind}, "
         f"{search.resources.concurrent} trials at a time"
     )
+    for remark in search.remarks:
+        say(f"note: {remark}")
 
 
 @app.command("run")

@@ -22,8 +22,10 @@ from pipelines.commands.common import (
     say,
     say_json,
     table,
+    tell,
 )
 from pipelines.errors import InputError
+from pipelines.files import regular
 
 app = typer.Typer(help="Check, run, follow and move studies.", no_args_is_help=True)
 
@@ -31,6 +33,8 @@ app = typer.Typer(help="Check, run, follow and move studies.", no_args_is_help=T
 @app.command("check")
 def check(file: File, profile: Profile = "quick", variant: Variant = None, overrides: Sets = None) -> None:
     """Say what a study would run, or everything that is wrong with it. Starts nothing."""
+    from pipelines.origin import another
+    from pipelines.store import Home, work_folder
     from pipelines.study import changes
 
     study = load_study(file, profile, overrides, variant)
@@ -39,9 +43,13 @@ def check(file: File, profile: Profile = "quick", variant: Variant = None, overr
         differs = ", ".join(f"{key}={value}" for key, value in changes(study.base, setting).items()) or "the base"
         rows.append([arm, differs, str(study.seeds), f"{study.steps:,}", str(setting.trainer.num_envs)])
     say(f"{study.name} ({study.profile}): {study.question}")
+    if remark := another(Home(work_folder()), study.name, study.profile, study.file):
+        say(remark)
     table(["arm", "differs in", "seeds", "steps", "copies"], rows, numbers=("seeds", "steps", "copies"))
     runs = len(study.arms) * study.seeds
     say(f"{runs} runs, {runs * study.steps:,} environment steps in all, {study.resources.concurrent} runs at a time")
+    for remark in study.remarks:
+        say(f"note: {remark}")
 
 
 @app.command("run")
@@ -93,7 +101,7 @@ def _listed(file: Path) -> dict[str, Any] | None:
     nodes = root.children if root else {}
     if "arms" in nodes and any("space" in arm.children for arm in nodes["arms"].children.values()):
         return None
-    question = str(nodes["question"].value) if "question" in nodes else ""
+    question = " ".join(str(nodes["question"].value).split()) if "question" in nodes else ""
     fault = "" if question else str(faults[0]) if faults else "no question"
     variants = list(nodes["variants"].children) if "variants" in nodes else []
     return {"study": str(file), "question": question, "variants": variants, "fault": fault}
@@ -120,6 +128,8 @@ def export_runs(
     except StoreError as error:
         raise InputError(str(error)) from error
     say(f"{out}: {packed.finished} of {packed.planned} runs finished, {packed.begun} under way")
+    for line in packed.astray:
+        print(f"left out, for it went astray: {line}", file=sys.stderr)
     say(f"there:  rhmc study import {out.name}")
 
 
@@ -128,6 +138,8 @@ def import_runs(
     bundle: Annotated[Path, typer.Argument(metavar="BUNDLE", help="What `rhmc study export` wrote.")],
 ) -> None:
     """Take in runs from another machine: `rhmc study run` then goes on from there."""
+    if not bundle.is_dir():
+        regular(bundle)
     from pipelines.bundle import unpack
     from pipelines.store import StoreError, work_folder
 
@@ -140,7 +152,8 @@ def import_runs(
         f"{taken.begun} to be continued"
     )
     if taken.foreign:
-        say(f"made by other code ({taken.foreign}): with the code here these runs would be trained again")
+        say(f"{taken.foreign} of them were made by other code: `rhmc study run` would train them again")
+        say("`rhmc study adopt FILE` lets them count where trainings of today repeat them bit for bit")
 
 
 @app.command("adopt")
@@ -180,6 +193,10 @@ def export(
     """Write each study's results as one tidy table and a table of its runs, for the report."""
     studies = load_studies(files, profile, overrides, variant)
     from pipelines.export import export_study
+    from pipelines.plan import given_twice
+
+    if faults := given_twice(studies):
+        raise InputError(*faults)
 
     code = DONE
     for study in studies:
@@ -190,5 +207,5 @@ def export(
     words += ["--profile", profile] if profile != "quick" else []
     words += ["--variant", variant] if variant and len(files) == 1 else []
     words += ["--runs", str(out)] if out else []
-    print(f"next:  {shlex.join(words)}", file=sys.stderr)
+    tell(f"next:  {shlex.join(words)}")
     raise typer.Exit(code)

@@ -6,14 +6,17 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterable
+from contextlib import suppress
 from itertools import groupby
 from pathlib import Path
+from threading import Thread
 from types import FrameType
 from typing import Annotated
 
 import typer
 
-from pipelines.commands.common import DONE, UNFINISHED, say
+from pipelines.addresses import fault, scrubbed, without_password
+from pipelines.commands.common import DONE, UNFINISHED, say, tell
 from pipelines.errors import InputError
 
 HOST = "127.0.0.1"
@@ -23,26 +26,25 @@ PATIENCE = 10.0  # seconds for the server to end by itself
 
 def ui(port: Annotated[int, typer.Option(min=1, max=65535, help="Where to listen on this machine.")] = 5000) -> None:
     """Show the logged runs in the browser: MLflow on this machine only, until Ctrl-C."""
-    from pipelines.store import Home, StoreError, work_folder
+    from pipelines.store import Home, work_folder
 
     uri = os.environ.get("MLFLOW_TRACKING_URI")
+    if uri and (said := fault("MLFLOW_TRACKING_URI", uri)):
+        raise InputError(said)
     if uri and uri.startswith(("http://", "https://")):
-        print(f"{uri.rstrip('/')}/#/experiments?workflowType=machine_learning")
+        print(f"{without_password(uri).rstrip('/')}/#/experiments?workflowType=machine_learning")
         return
     home = Home(work_folder())
     if not uri and not home.database.exists():
         raise InputError(f"{home.database}: nothing is logged yet; `rhmc study run FILE` does it")
-    from pipelines.mlflow_tracker import addresses
-    from pipelines.mlflow_tracker import check as check_store
+    from pipelines.mlflow_tracker import addresses, prepared
 
-    try:
-        home.prepare()
-        check_store(uri or f"sqlite:///{home.database}")
-        saved = addresses(uri or f"sqlite:///{home.database}", f"http://{HOST}:{port}")
-    except StoreError as error:
-        raise InputError(str(error)) from error
+    home.prepare()
+    store = prepared(home)
+    saved = addresses(store, f"http://{HOST}:{port}")
     _free(port)
-    _serve(uri or f"sqlite:///{home.database}", home.artifacts, port, saved)
+    # MLflow makes the folders of a SQLite address as it is written, with %20 for a space; a bare name has none.
+    _serve(uri or f"sqlite:///{home.database.name}", home.artifacts, port, saved)
 
 
 def _free(port: int) -> None:
@@ -57,30 +59,63 @@ def _free(port: int) -> None:
 
 
 def _serve(uri: str, artifacts: Path, port: int, saved: Iterable[tuple[str, str, str]]) -> None:
-    command = [sys.executable, "-m", "mlflow", "server", "--backend-store-uri", uri]
-    command += ["--host", HOST, "--port", str(port), "--workers", "1", "--artifacts-destination", str(artifacts)]
-    quiet = {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false", "MLFLOW_DISABLE_TELEMETRY": "true", "DO_NOT_TRACK": "true"}
+    """Run MLflow's server in the work folder.
+
+    Args:
+        uri: of the database, a SQLite file of the work folder by its name. It may hold a password, and the arguments
+            of a process are seen by everybody: it goes by the environment.
+        artifacts: where files are that are uploaded to the server.
+        port: where to listen.
+        saved: what to print once it answers.
+    """
+    command = [sys.executable, "-m", "mlflow", "server", "--host", HOST, "--port", str(port), "--workers", "1"]
+    command += ["--artifacts-destination", artifacts.as_uri()]
+    settings = {
+        "MLFLOW_BACKEND_STORE_URI": uri,
+        "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false",
+        "MLFLOW_DISABLE_TELEMETRY": "true",
+        "DO_NOT_TRACK": "true",
+        "PYTHONSAFEPATH": "1",  # no module of the work folder is taken for one of Python's
+    }
 
     def leave(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
     signal.signal(signal.SIGTERM, leave)
     log = artifacts.parent / LOG
-    with log.open("wb") as said:
-        # A session of its own: the server is several processes, and whatever ends us ends all of them.
-        server = subprocess.Popen(
-            command, env=os.environ | quiet, start_new_session=True, stdout=said, stderr=subprocess.STDOUT
-        )
+    log.touch()  # see that it can be written before anything is started
+    # A session of its own: the server is several processes, and whatever ends us ends all of them.
+    server = subprocess.Popen(
+        command,
+        cwd=artifacts.parent,
+        env=os.environ | settings,
+        start_new_session=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+    )
+    talk = Thread(target=_write_down, args=(server, log), daemon=True)
+    talk.start()
     try:
         if _answers(server, port):
             _tell(port, saved)
         code = server.wait()
+        talk.join(1.0)  # what it said last
     except KeyboardInterrupt:
         _end(server)
         return
     if code:
-        print(f"rhmc: MLflow's server ended with exit code {code}; {log} says why", file=sys.stderr)
+        tell(f"rhmc: MLflow's server ended with exit code {code}; {log} says why")
     raise typer.Exit(UNFINISHED if code else DONE)
+
+
+def _write_down(server: "subprocess.Popen[bytes]", log: Path) -> None:
+    """What the server says, line by line, without passwords; to the end, for it waits where nobody reads on."""
+    assert server.stdout is not None
+    with suppress(OSError), log.open("w", encoding="utf-8") as file:
+        for line in server.stdout:
+            print(scrubbed(line.decode(errors="replace").rstrip("\n")), file=file, flush=True)
+    for _ in server.stdout:  # the disk is full
+        pass
 
 
 def _answers(server: "subprocess.Popen[bytes]", port: int) -> bool:

@@ -1,15 +1,15 @@
 """`rhmc yardsticks`: scores of policies that need no learning."""
 
 import inspect
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipelines.commands.common import DONE, Json, Profile, folder_option, say_json, table
+from pipelines.commands.common import DONE, Json, Profile, folder_option, profile_faults, say_json, table, tell
 from pipelines.errors import InputError
+from pipelines.limits import EPISODES, JOBS, SEED
 
 if TYPE_CHECKING:
     from pipelines.yardsticks import Scored
@@ -43,11 +43,11 @@ def verb(name: str) -> Callable[[Callable[..., Fields]], Callable[..., None]]:
 def _score(
     kind: str,
     fields: Fields,
-    episodes: Annotated[int, typer.Option(min=2, help="Episodes of the bank.")] = 1000,
+    episodes: Annotated[int, typer.Option(min=2, max=EPISODES, help="Episodes of the bank.")] = 1000,
     policies: Annotated[
         str | None, typer.Option(help="Names with commas between; all but the planner if not given.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Names the bank of episodes.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=SEED, help="Names the bank of episodes.")] = 0,
     as_json: Json = False,
     out: Annotated[
         Path | None, typer.Option(help="Also write yardsticks.parquet there, beside the runs' tables.")
@@ -68,7 +68,7 @@ def _score(
             from pipelines.yardsticks import Bank, Scored, export_yardsticks
 
             written = export_yardsticks([Scored(Bank(env, tuple(scores), episodes, seed), scores)], profile, out)
-            print(f"wrote {written}", file=sys.stderr)
+            tell(f"wrote {written}")
     if as_json:
         say_json(scores)
         raise typer.Exit(DONE)
@@ -79,15 +79,13 @@ def _score(
 
 def _check(kind: str, policies: list[str], profile: str) -> None:
     from pipelines.document import choices
-    from pipelines.study import PROFILES
     from rhmc.yardsticks import names
 
     known = names(kind)
     faults = [f"--policies: '{n}' is not allowed; {choices(n, known)}" for n in policies if n not in known]
-    if profile not in PROFILES:
-        faults.append(f"--profile: '{profile}' is not allowed; {choices(profile, PROFILES)}")
+    faults += profile_faults(profile)
     if faults:
-        raise InputError("\n".join(faults))
+        raise InputError(*faults)
 
 
 def _env(kind: str, fields: Fields) -> Any:
@@ -100,7 +98,7 @@ def _env(kind: str, fields: Fields) -> Any:
 
     cfg, faults = validate(ENVS[kind].config, node({name: node(value, name) for name, value in fields.items()}, kind))
     if cfg is None:
-        raise InputError("\n".join(str(fault) for fault in faults))
+        raise InputError(*map(str, faults))
     return cfg
 
 
@@ -128,7 +126,7 @@ def navigation(
 def everything(
     out: Annotated[Path, typer.Option(help="Folder of the tables that the report reads; made if it is not there.")],
     profile: Profile = "quick",
-    jobs: Annotated[int, typer.Option(min=1, help="Banks at a time.")] = 2,
+    jobs: Annotated[int, typer.Option(min=1, max=JOBS, help="Banks at a time.")] = 2,
 ) -> None:
     """Every task, policy and bound that the report uses: yardsticks.parquet and yardsticks.runs.parquet.
 
@@ -143,10 +141,10 @@ def everything(
         for scored in score_banks(wanted, jobs):
             found.append(scored)
             policies = f"{len(scored.scores)} policies" if len(scored.scores) > 1 else next(iter(scored.scores))
-            print(f"{len(found)} of {len(wanted)}: {_named(scored)}: {policies}", file=sys.stderr, flush=True)
+            tell(f"{len(found)} of {len(wanted)}: {_named(scored)}: {policies}")
         written = export_yardsticks(found, profile, out)
     _show(found)
-    print(f"wrote {written}", file=sys.stderr)
+    tell(f"wrote {written}")
 
 
 def _show(found: list["Scored"]) -> None:

@@ -17,6 +17,7 @@ import tempfile
 import threading
 import time
 import urllib.request
+from collections.abc import Callable
 from contextlib import nullcontext, suppress
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
@@ -30,14 +31,16 @@ from sqlalchemy.engine import Engine
 from werkzeug.serving import WSGIRequestHandler, make_server
 
 from pipelines import ray_driver, run
+from pipelines.bundle import unpack
+from pipelines.errors import InputError
 from pipelines.mlflow_tracker import open_existing
 from pipelines.names import full
 from pipelines.plan import study_card
 from pipelines.recorders import Recorders
 from pipelines.store import Home
 from pipelines.study import Study
+from pipelines.tracker import StudyCard
 from pipelines.trainable import RunTrainable
-from tests.pipelines.support import CODE
 
 ray.tune.trainable.trainable.DEFAULT_STORAGE_PATH = tempfile.gettempdir() + "/ray_results"  # not in a tester's home
 PRELOAD = ["mlflow.server", "mlflow.store.tracking.sqlalchemy_store"]
@@ -65,7 +68,12 @@ class Run(NamedTuple):
 
 def everything(study: Study, home: Path) -> list[Run]:
     """All that a study has logged and its parent, in an order that does not depend on when it was logged."""
-    tracker = open_existing(study_card(study), Home(home))
+    return logged(study_card(study), home)
+
+
+def logged(card: StudyCard, home: Path) -> list[Run]:
+    """See `everything`; of a study or a search."""
+    tracker = open_existing(card, Home(home))
     assert tracker is not None
     found = tracker.client.search_runs([tracker.experiment], "", ViewType.ACTIVE_ONLY, 1000)
     return sorted(_run(tracker.client, one, home) for one in found)
@@ -131,9 +139,12 @@ class Fuse:
 
     def __init__(self, length: int) -> None:
         self.length, self.count = length, 0
+        self.counts: Callable[[], bool] = lambda: True  # whether a write counts now
 
     def tick(self) -> None:
         """A write is about to happen."""
+        if not self.counts():
+            return
         self.count += 1
         if self.count == self.length:
             os.kill(os.getpid(), signal.SIGKILL)
@@ -179,6 +190,14 @@ def launch(study: Study, home: Path, length: int = FOREVER, room: int | None = N
     return process.exitcode
 
 
+def import_in_a_process(bundle: Path, home: Path, length: int = FOREVER, room: int | None = None) -> int:
+    """The exit code of a process that takes in a bundle; see `start_launch`."""
+    process = start(_import, str(bundle), str(home), length, room)
+    process.join()
+    assert process.exitcode is not None
+    return process.exitcode
+
+
 def start(target: Any, *args: Any) -> ForkServerProcess:
     """Fork a process."""
     FORKS.set_forkserver_preload([__name__, *PRELOAD])
@@ -188,13 +207,12 @@ def start(target: Any, *args: Any) -> ForkServerProcess:
 
 
 def _drive(study: str, home: str, uri: str | None, length: int, room: int | None) -> None:
-    _settle(Path(home) / "driver.log")
+    settle(Path(home) / "driver.log")
     if room:
         resource.setrlimit(resource.RLIMIT_FSIZE, (room, room))
     if uri:
         os.environ["MLFLOW_TRACKING_URI"] = uri
     os.environ["MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR"] = "0"  # at most a second between two tries
-    run.fingerprint = lambda: CODE
     ray_driver.ray_session = lambda *args: nullcontext([])
     ray_driver.fit = fit_here
     fuse = Fuse(length)
@@ -204,7 +222,21 @@ def _drive(study: str, home: str, uri: str | None, length: int, room: int | None
     sys.exit(status)
 
 
-def _settle(log: Path) -> None:
+def _import(bundle: str, home: str, length: int, room: int | None) -> None:
+    settle(Path(home) / "driver.log")
+    if room:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (room, room))
+    fuse = Fuse(length)
+    fuse.lay(home)
+    try:
+        unpack(Path(bundle), Path(home))
+    except InputError as error:
+        print(error)
+        sys.exit(2)
+    (Path(home) / "writes").write_text(str(fuse.count))
+
+
+def settle(log: Path) -> None:
     """Write to the log, and end when the tests do, however they do."""
     handle = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     os.dup2(handle, 1)
@@ -275,7 +307,7 @@ class _Quiet(WSGIRequestHandler):
 
 
 def _serve(home: str, port: int, length: int) -> None:
-    _settle(Path(home) / "server.log")
+    settle(Path(home) / "server.log")
     logging.getLogger("alembic").setLevel(logging.ERROR)
     os.environ["_MLFLOW_SERVER_FILE_STORE"] = f"sqlite:///{home}/mlflow.db"
     os.environ["_MLFLOW_SERVER_ARTIFACT_ROOT"] = "mlflow-artifacts:/"

@@ -32,12 +32,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(scope="session")
 def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A fresh MLflow database: making one takes seconds, copying one does not."""
-    from pipelines.mlflow_tracker import MlflowTracker
+    from pipelines.mlflow_tracker import create_database
     from pipelines.store import Home
-    from pipelines.tracker import StudyCard
 
     home = Home(tmp_path_factory.mktemp("template"))
-    MlflowTracker(StudyCard("template", "quick", ""), home, write=False)
+    create_database(home.database)
     return home.database
 
 

@@ -55,7 +55,7 @@ def tiny(name: str = "tiny", points: int = 3, arms: dict[str, Setting] | None = 
 
 def plan(study: Study | None = None) -> list[Item]:
     """Its runs."""
-    return items(study or tiny(), CODE, "abc-dirty")
+    return items(study or tiny(), "abc-dirty")
 
 
 def jobs_of(module: str, monkeypatch: pytest.MonkeyPatch) -> list[int]:

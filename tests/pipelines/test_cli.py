@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import pandas as pd
 import pytest
@@ -22,9 +22,10 @@ from pipelines import cli, yardsticks
 from pipelines.commands import ui
 from pipelines.commands.doctor import MARK
 from pipelines.doctor import Finding
-from pipelines.fingerprint import fingerprint
+from pipelines.identity import fingerprint
 from pipelines.side_by_side import KILLED
 from rhmc.yardsticks import names
+from tests.pipelines.fleet import wait_for
 from tests.pipelines.support import jobs_of
 
 ROOT = Path(__file__).parents[2]
@@ -90,7 +91,7 @@ VERBS = [
     *([], ["study"], ["study", "run"], ["study", "export"], ["study", "import"], ["yardsticks"], ["evaluate"]),
     *(["yardsticks", "all"], ["transfer"], ["assignments"]),
     *(["search"], ["search", "check"], ["search", "run"], ["search", "status"]),
-    *(["export"], ["report"], ["ui"], ["doctor"]),
+    *(["export"], ["report"], ["ui"], ["doctor"], ["profile"]),
 ]
 
 
@@ -232,7 +233,7 @@ def test_what_travels_is_refused_in_one_line(rhmc: Rhmc, tmp_path: Path) -> None
     assert said == (2, "", "x (quick): no run is finished or under way; nothing to export\n")
     said = rhmc("study", "import", "b.zip")
     assert (said.code, said.out, said.err.count("\n")) == (2, "", 1)
-    assert said.err.startswith("b.zip: not a bundle of `rhmc study export`")
+    assert said.err.startswith("b.zip: cannot be read: No such file or directory")
     assert not (tmp_path / "work").exists()
 
 
@@ -291,7 +292,7 @@ def test_studies_that_cannot_run_together(rhmc: Rhmc, tmp_path: Path) -> None:
     said = rhmc("study", "run", "studies/x.yaml", "studies/y.yaml", "studies/x.yaml")
     twice, shared = said.err.splitlines()
     assert said.code == 2
-    assert twice == "x: given 2 times; studies that run together need names of their own"
+    assert twice == "x: given 2 times; studies that go together need names of their own"
     assert shared.startswith("resources.concurrent is 3 in y and 2 in x; ")
     assert not (tmp_path / "work").exists()
 
@@ -328,7 +329,7 @@ def test_an_interrupt_is_130(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> Non
 @pytest.mark.parametrize("options", [["--profile", "paper"], ["--profile", "quick", "--runs", "a", "--out", "b"]])
 def test_report_hands_on_its_options(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch, options: list[str]) -> None:
     calls: list[list[str]] = []
-    build = SimpleNamespace(main=lambda given: calls.append(given) or 2)
+    build = SimpleNamespace(main=lambda given, shown: calls.append(given) or 2)
     monkeypatch.setitem(sys.modules, "reports.build", build)
     assert rhmc("report", *options).code == 2
     assert calls == [options]
@@ -588,10 +589,11 @@ class Server:
     pid = 4711
 
     def __init__(
-        self, command: list[str], env: dict[str, str], *, start_new_session: bool, stdout: IO[bytes], stderr: int
+        self, command: list[str], env: dict[str, str], *, cwd: Path, start_new_session: bool, stdout: int, stderr: int
     ) -> None:
         assert start_new_session
-        stdout.write(b"talk")
+        assert cwd.name == "work"
+        self.stdout = io.BytesIO(b"talk of http://me:secret@host\n\xff\n")
         Server.given = command, env
 
     def poll(self) -> None:
@@ -618,7 +620,7 @@ def test_ui_serves_the_store_on_this_machine_only_until_ctrl_c(
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     killed: list[tuple[int, int]] = []
-    monkeypatch.setattr(ui, "subprocess", SimpleNamespace(Popen=Server, STDOUT=-2))
+    monkeypatch.setattr(ui, "subprocess", SimpleNamespace(Popen=Server, STDOUT=-2, PIPE=-1))
     monkeypatch.setattr(ui.os, "killpg", lambda *given: killed.append(given))
     monkeypatch.setattr(ui.signal, "signal", lambda *given: None)
     asked = iter([OSError("not yet"), io.BytesIO()])
@@ -640,8 +642,11 @@ def test_ui_serves_the_store_on_this_machine_only_until_ctrl_c(
     assert said.code == 0
     assert said.out.startswith(f"http://127.0.0.1:{port}/#/experiments?workflowType=machine_learning ")
     options = dict(zip(command[4::2], command[5::2], strict=True))
-    assert options["--backend-store-uri"] == f"sqlite:///{store}"
-    assert (store.parent / "ui.log").read_text() == "talk"
+    assert "--backend-store-uri" not in options  # everybody sees the arguments of a process
+    assert env["MLFLOW_BACKEND_STORE_URI"] == "sqlite:///mlflow.db"  # in the work folder, where the server runs
+    assert options["--artifacts-destination"] == (store.parent / "artifacts").as_uri()
+    log = store.parent / "ui.log"
+    wait_for(lambda: log.read_text() == "talk of http://me:***@host\n\ufffd\n", "ui.log")
     assert (options["--host"], options["--port"], options["--workers"]) == ("127.0.0.1", str(port), "1")
     assert env["MLFLOW_SERVER_ENABLE_JOB_EXECUTION"] == "false"
     assert env["MLFLOW_DISABLE_TELEMETRY"] == "true"
@@ -650,8 +655,9 @@ def test_ui_serves_the_store_on_this_machine_only_until_ctrl_c(
 def test_ui_tells_no_address_of_a_server_that_ended_at_once(
     rhmc: Rhmc, store: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    ended = SimpleNamespace(poll=lambda: 3, wait=lambda: 3)
-    monkeypatch.setattr(ui, "subprocess", SimpleNamespace(Popen=lambda command, **options: ended, STDOUT=-2))
+    ended = SimpleNamespace(poll=lambda: 3, wait=lambda: 3, stdout=io.BytesIO())
+    popen = SimpleNamespace(Popen=lambda command, **options: ended, STDOUT=-2, PIPE=-1)
+    monkeypatch.setattr(ui, "subprocess", popen)
     monkeypatch.setattr(ui, "_free", lambda port: None)
     monkeypatch.setattr(ui.signal, "signal", lambda *given: None)
     why = f"rhmc: MLflow's server ended with exit code 3; {store.parent}/ui.log says why\n"

@@ -64,7 +64,7 @@ def listener(says: bytes) -> Iterator[str]:
 
         def answer() -> None:
             line, _ = server.accept()
-            line.recv(100)
+            line.recv(1000)
             line.sendall(says)
             line.close()
 
@@ -80,16 +80,46 @@ def test_a_cluster_that_is_not_there_is_one_line() -> None:
             knock(address)
 
 
-@pytest.mark.parametrize("says", [b"HTTP/1.1 400 Bad Request\r\n\r\n", b""])
+@pytest.mark.parametrize("says", [b"HTTP/1.1 400 Bad Request\r\n\r\n", b"", b"\0\0\0\4\0\0\0\0\0"])
 def test_what_is_not_ray_is_known_at_once(says: bytes) -> None:
     with listener(says) as address, pytest.raises(StoreError, match="what answers there is not Ray"):
         knock(address)
 
 
-def test_what_speaks_as_ray_does_is_let_through() -> None:
-    with listener(b"\0\0\0\4\0\0\0\0\0") as address:
-        knock(address)
+HTTP2 = b"\0\0\0\4\0\0\0\0\0"  # an empty frame with settings, as the first
+LOCKED = HTTP2 + b"grpc-status\x0216\0grpc-message>InvalidAuthToken: Authentication token is missing or incorrect"
+OPEN = HTTP2 + b"\n\0\x12\x062.60.0@grpc-status\x010"
+
+
+def test_what_speaks_as_ray_does_is_let_through(monkeypatch: pytest.MonkeyPatch) -> None:
+    for mode in ("", "token"):
+        monkeypatch.setenv("RAY_AUTH_MODE", mode)
+        with listener(LOCKED) as address:
+            knock(address)
     knock("auto")  # no place to knock at
+
+
+def test_a_cluster_that_is_open_to_anybody_is_joined_only_if_that_is_meant(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("RAY_AUTH_MODE", raising=False)
+    with (
+        listener(OPEN) as address,
+        pytest.raises(StoreError, match=f"{address}: it asks nobody .* RAY_AUTH_MODE=token"),
+    ):
+        knock(address)
+    assert cluster.exposed() == []
+    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
+    with listener(OPEN) as address:
+        knock(address)
+    assert "whoever reaches it can run code" in cluster.exposed()[0]
+
+
+def test_a_cluster_that_wants_a_token_is_told_from_one_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
+    with (
+        listener(LOCKED) as address,
+        pytest.raises(StoreError, match="it asks for a token, and RAY_AUTH_MODE=disabled"),
+    ):
+        knock(address)
 
 
 def test_rays_client_is_refused() -> None:
@@ -313,8 +343,6 @@ def nodes_of(home: Path) -> dict[str, tuple[str, list[str]]]:
 def test_a_study_survives_the_death_of_a_node(
     tmp_path: Path, template: Path, at_site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in ("export", "run", "bundle"):
-        monkeypatch.setattr(f"pipelines.{module}.fingerprint", lambda: CODE)
     home = tmp_path / "shared"
     home.mkdir()
     other = at_site.cluster.start()

@@ -1,6 +1,7 @@
 """What the doctor says of installations that are well and of those that are not."""
 
 import sys
+from contextlib import nullcontext
 from importlib.metadata import version
 from pathlib import Path
 
@@ -110,7 +111,15 @@ def test_a_cluster_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> None
 
 @pytest.mark.ray
 def test_ray_starts(cluster: None) -> None:
-    assert starts_ray() == [Finding("ok", "ray", "starts")]
+    text = "starts, listens on 127.0.0.1 alone and asks for a token"
+    assert starts_ray() == [Finding("ok", "ray", text)]
+
+
+@pytest.mark.parametrize("fence", [("192.0.2.1", True), ("127.0.0.1", False)])
+def test_a_ray_that_strangers_reach_is_a_fault(fence: tuple[str, bool], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipelines.ray_driver.ray_session", lambda *args, **kwargs: nullcontext([]))
+    monkeypatch.setattr("pipelines.cluster.fence", lambda: fence)
+    assert [one.level for one in starts_ray()] == ["fault"]
 
 
 def test_an_examination_goes_on_after_a_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -118,6 +127,6 @@ def test_an_examination_goes_on_after_a_fault(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(doctor, "LOCK", tmp_path / "none")
     monkeypatch.setattr(doctor, "requires", lambda name: ["torch==0.1", 'x==1; extra == "test"'])
     found = list(examine(tmp_path, ray=False))
-    assert [one.what for one in found] == ["python", "libraries", "torch", "work folder", "store"]
+    assert [one.what for one in found] == ["python", "libraries", "torch", "code", "work folder", "store"]
     assert found[1].level == "fault"
     assert str(sys.executable) in found[0].text

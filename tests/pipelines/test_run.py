@@ -17,10 +17,10 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
 
+import pyarrow.parquet as pq
 import pytest
 import torch
 from filelock import FileLock
-from pipelines.fingerprint import fingerprint
 from rich.console import Console
 from ruamel.yaml import YAML
 
@@ -29,7 +29,6 @@ from pipelines.export import export_study
 from pipelines.mlflow_tracker import MlflowTracker, open_existing
 from pipelines.plan import Item, commit, items, study_card, what_varies
 from pipelines.progress import LiveBoard, PlainBoard, duration
-from pipelines.ray_driver import sockets
 from pipelines.recorder import Recorder
 from pipelines.recorders import Recorders
 from pipelines.run import Interrupts, _arguments, animated, run_studies, show_status
@@ -39,7 +38,7 @@ from pipelines.tracker import MemoryRun, MemoryTracker, StudyCard, points_of
 from rhmc.algorithms import iql
 from rhmc.trainer import Trainer
 from tests.pipelines.chaos import fit_here
-from tests.pipelines.support import plan, setting, spec, tiny
+from tests.pipelines.support import CODE, plan, setting, spec, tiny
 
 STUDY = StudyCard("tiny", "quick", "")
 POINTS = [{"step": float(step), "eval/return": step / 100, "time/steps_per_second": 50.0} for step in (0, 200, 400)]
@@ -362,7 +361,7 @@ def test_a_terminal_gets_a_line_per_running_run() -> None:
 
 def test_runs_of_a_killed_driver_are_not_said_to_be_running(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
     study = tiny()
-    plan = items(study, fingerprint(), "")
+    plan = items(study)
     MlflowTracker(study_card(study), Home(home)).start(plan[0].card)
 
     def slow() -> dict[str, int]:
@@ -373,6 +372,41 @@ def test_runs_of_a_killed_driver_are_not_said_to_be_running(home: Path, capsys: 
     with Home(home).lock(study.name, study.profile):
         assert (slow()["running"], slow()["interrupted"]) == (1, 0)
     assert (slow()["running"], slow()["interrupted"]) == (0, 1)
+
+
+def test_a_run_that_diverges_looks_failed_everywhere(
+    home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(ray_driver, "ray_session", lambda *args: nullcontext([]))
+    monkeypatch.setattr(ray_driver, "fit", fit_here)
+    study = tiny(arms={"calm": setting(lr=1e-3), "wild": setting(lr=1e6, warmup=0)})
+    assert run_studies([study], home) == 1
+    said = capsys.readouterr().out
+    (line,) = [line for line in said.splitlines() if line.startswith("failed: ")]
+    assert line.startswith("failed: tiny / wild s0: diverged: train/")
+    assert "at step 200; every value must be finite" in line
+    assert re.search(r"wild +0 of 1 +- *$", said, re.MULTILINE)
+
+    assert show_status(study, home) == 1
+    assert line in capsys.readouterr().out.splitlines()
+    assert show_status(study, home, as_json=True) == 1
+    told = json.loads(capsys.readouterr().out)
+    assert (told["arms"]["wild"]["failed"], told["arms"]["wild"]["finished"]) == (1, 0)
+    assert told["errors"] == {"tiny / wild s0": line.removeprefix("failed: tiny / wild s0: ")}
+
+    tracker = open_existing(study_card(study), Home(home))
+    assert tracker is not None
+    wild = next(run for run in tracker.recorded() if run.arm == "wild")
+    kept = {file.path for file in tracker.client.list_artifacts(wild.ref)}
+    assert (wild.status, wild.error, kept) == ("failed", told["errors"]["tiny / wild s0"], {"config.yaml", "error.txt"})
+    assert not list(tracker.client.search_model_versions(f"run_id = '{wild.ref}'"))
+    assert {row.step for row in tracker.rows([wild.ref])} == {0}
+
+    assert export_study(study, home / "out", home) == 1
+    table = pq.read_table(home / "out" / "tiny.runs.parquet").to_pandas().set_index("arm")
+    assert table.status.to_dict() == {"calm": "finished", "wild": "failed"}
+    assert run_studies([study], home) == 1  # the same settings, the same end
+    assert line in capsys.readouterr().out.splitlines()
 
 
 # What may be in the way
@@ -513,15 +547,6 @@ def test_a_signal_in_the_middle_of_a_print_disturbs_no_line(tmp_path: Path) -> N
     assert [line for line in lines if line not in said] == [*(f"{k:100}" for k in range(2000)), "143"]
 
 
-def test_the_folder_of_a_killed_driver_is_used_again() -> None:
-    with sockets("test-of-sockets") as folder:
-        (folder / "left").touch()
-        with sockets("test-of-sockets") as same:
-            assert same == folder
-            assert list(same.iterdir()) == []
-    assert not folder.exists()
-
-
 # The whole chain
 
 
@@ -539,7 +564,7 @@ def test_a_run_that_another_process_trains_is_trained_when_that_lets_go(
     monkeypatch.setattr(trainable, "PATIENCE", 0.0)
     monkeypatch.setattr(ray_driver, "fit", fit)
     monkeypatch.setattr(ray_driver, "ray_session", lambda *args: nullcontext([]))
-    key = f"{tiny().runs()[0].spec.id}-{fingerprint()}"
+    key = f"{tiny().runs()[0].spec.id}-{CODE}"
     Home(home).checkpoints(key).parent.mkdir()
     held = FileLock(f"{Home(home).checkpoints(key)}.lock")
     held.acquire()
@@ -552,7 +577,7 @@ def test_a_run_that_another_process_trains_is_trained_when_that_lets_go(
 def test_run_skip_fail_and_retry(home: Path, cluster: None, capsys: pytest.CaptureFixture[str]) -> None:
     study = tiny()
     slow, fast = study.runs()
-    blocked = Home(home).checkpoints(f"{slow.spec.id}-{fingerprint()}")
+    blocked = Home(home).checkpoints(f"{slow.spec.id}-{CODE}")
     blocked.parent.mkdir()
     blocked.touch()  # a file where the checkpoints of `slow` should go
 

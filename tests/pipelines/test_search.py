@@ -23,6 +23,7 @@ from ruamel.yaml import YAML
 
 from pipelines import cli
 from pipelines.found import file_name, winner_yaml
+from pipelines.health import DivergedError
 from pipelines.mlflow_tracker import open_existing
 from pipelines.pool import Failed
 from pipelines.progress import PlainBoard
@@ -33,6 +34,7 @@ from pipelines.seeds import Seeds
 from pipelines.store import Home, StoreError
 from pipelines.study import Setting, Study, StudyError
 from pipelines.tracker import MemoryRun, MemoryTracker, points_of
+from pipelines.trainable import ending
 from pipelines.trials import ATTEMPTS, Ledger, look, open_storage
 from rhmc.trainer import Trainer
 from tests.pipelines.support import CODE, setting
@@ -111,13 +113,15 @@ def test_an_override_changes_the_budget_of_all() -> None:
 
 
 def test_more_trials_continue_a_search_and_anything_else_begins_another() -> None:
-    def identity(text: str, code: str = CODE) -> str:
-        return load(text).identity("IQL", code)
+    def identity(text: str) -> str:
+        return load(text).identity("IQL")
 
     first = identity(GOOD)
     assert identity(changed("quick: 5", "quick: 50")) == first
     assert identity(GOOD.replace("high: 32", "high: 31")) == first  # of the other arm
-    assert identity(GOOD, "0ther") != first
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pipelines.search.code_id", lambda *place: "0ther")
+        assert identity(GOOD) != first
     for old, new in [
         ("high: 0.9", "high: 0.8"),
         ("seeds: 2", "seeds: 3"),
@@ -310,6 +314,8 @@ class Twin:
             curves = {seed: self.shape(Setting.model_validate_json(job["spec"]), seed) for seed in job["seeds"]}
         except ValueError as error:
             return {key: Failed(f"ValueError: {error}", "Traceback")}
+        except DivergedError as error:
+            return {key: ending(error=str(error), trace="Traceback", diverged=True)}
         last = len(next(iter(curves.values()))) - 1
         self.disk[key] = now = min(last, self.disk.get(key, -1) + 1)
         points = [point(curves, k, last) for k in range(self.told[key], now + 1)]
@@ -335,7 +341,7 @@ class World:
         self.out = StringIO()
 
     def ledgers(self) -> list[Ledger]:
-        return [Ledger(self.search, arm, CODE, self.storage) for arm in self.search.arms]
+        return [Ledger(self.search, arm, self.storage) for arm in self.search.arms]
 
     def launch(self, shape: Curve = curve, size: int = 1, twin: Twin | None = None) -> Twin:
         ledgers = self.ledgers()
@@ -343,7 +349,7 @@ class World:
             ledger.take_up()
         workers = twin or Twin(self.disk, shape, size)
         tracker = MemoryTracker(search_card(self.search), self.shelf)
-        book = Book(self.search, CODE, tracker, PlainBoard(Console(file=self.out)))
+        book = Book(self.search, tracker, PlainBoard(Console(file=self.out)))
         Drive(self.search, ledgers, workers, book, Home(self.folder), self.folder / "stop").run()
         return workers
 
@@ -363,7 +369,7 @@ class World:
         for ledger in self.ledgers():
             best = ledger.best()
             assert best is not None
-            texts.append(winner_yaml(self.search, ledger.arm, best, ledger.counts(), CODE))
+            texts.append(winner_yaml(self.search, ledger.arm, best, ledger.counts()))
         return texts
 
 
@@ -464,6 +470,28 @@ def test_no_finite_return_ends_a_trial_and_counts(tmp_path: Path) -> None:
         assert whys
         assert set(whys) == {"no finite return at step 600" if ledger.arm == "VDN" else "no finite return at step 200"}
         assert ledger.closed == 5
+
+
+def test_a_trial_that_diverges_is_pruned_and_never_tried_again(tmp_path: Path) -> None:
+    def diverging(one: Setting, seed: int) -> list[float]:
+        if one.algo.lr > 1e-3:
+            raise DivergedError("diverged: train/td_loss is inf at step 200")
+        return curve(one, seed)
+
+    world = World(load(), tmp_path)
+    world.launch(diverging)
+    gone = [t for ledger in world.ledgers() for t in ledger.latest().values() if t.state.name == "PRUNED"]
+    assert gone
+    assert {t.user_attrs["pruned"] for t in gone} == {"diverged: train/td_loss is inf at step 200"}
+    assert all(t.params["lr"] > 1e-3 for t in gone)
+    assert [ledger.closed for ledger in world.ledgers()] == [5, 5]  # the search went on, and is whole
+    assert all(best.params["lr"] <= 1e-3 for ledger in world.ledgers() if (best := ledger.best()))
+    logs = [run for run in world.shelf if run.status == "failed"]
+    assert len(logs) == len(gone)
+    assert {(run.tags["state"], run.tags["error"]) for run in logs} == {
+        ("pruned", "diverged: train/td_loss is inf at step 200")
+    }
+    assert world.launch(diverging).trained == 0
 
 
 def test_a_trial_that_raises_is_tried_in_the_next_launches_and_then_left(tmp_path: Path) -> None:
@@ -589,7 +617,7 @@ def test_the_winner_says_where_it_comes_from_and_a_study_includes_it(tmp_path: P
     world = World(search, tmp_path)
     world.launch()
     tracker = MemoryTracker(search_card(search), world.shelf)
-    written = results(search, world.ledgers(), CODE, tracker, Home(tmp_path), Path("studies/found"))
+    written = results(search, world.ledgers(), tracker, Home(tmp_path), Path("studies/found"))
     assert [str(file) for file in written.winners] == [
         "studies/found/search_x.iql.quick.yaml",
         "studies/found/search_x.vdn.quick.yaml",
@@ -620,8 +648,9 @@ def test_the_winner_says_where_it_comes_from_and_a_study_includes_it(tmp_path: P
 
 def test_names_of_arms_become_names_of_files() -> None:
     search = load()
-    assert file_name(search, "RHMC, no filter") == "search_x.rhmc-no-filter.quick.yaml"
-    assert file_name(search, "…") == "search_x.arm.quick.yaml"
+    assert file_name(search, "HiT-MAC") == "search_x.hit-mac.quick.yaml"
+    assert file_name(search, "RHMC, no filter") == "search_x.rhmc-no-filter-6c95856d.quick.yaml"
+    assert file_name(search, "…") == "search_x.name-b4935894.quick.yaml"
 
 
 def test_no_plot_without_trials_for_it(tmp_path: Path) -> None:
@@ -684,7 +713,7 @@ def test_trials_of_other_code_are_stale(tmp_path: Path) -> None:
     world.launch()
     ledger, stale = look(world.search, "IQL", "0ther", world.storage)
     assert (ledger.closed, stale) == (0, 5)
-    ledger, stale = look(world.search, "IQL", CODE, world.storage)
+    ledger, stale = look(world.search, "IQL", world.storage)
     assert (ledger.closed, stale) == (5, 0)
 
 

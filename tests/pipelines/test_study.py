@@ -588,7 +588,7 @@ def test_files_that_cannot_be_read() -> None:
 
 
 def test_a_nest_without_end() -> None:
-    assert faults("x: " + "[" * 600) == ["studies/x.yaml: nested too deeply to be a study"]
+    assert faults("x: " + "[" * 600) == ["studies/x.yaml:1:33: nested too deeply; this is no study"]
 
 
 def test_an_unknown_profile() -> None:

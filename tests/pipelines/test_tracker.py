@@ -13,10 +13,11 @@ import pytest
 from mlflow import MlflowClient
 
 from pipelines import histories, mlflow_tracker
+from pipelines.addresses import without_password
 from pipelines.host import Host
 from pipelines.mlflow_tracker import MlflowTracker, open_existing
 from pipelines.names import shown
-from pipelines.store import Home, StoreError, without_password
+from pipelines.store import Home, StoreError
 from pipelines.tracker import Card, MemoryRun, MemoryTracker, Row, StudyCard, Tracker, points_of
 from tests.pipelines.chaos import Server
 

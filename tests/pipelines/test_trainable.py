@@ -1,7 +1,14 @@
 """A run as a Ray trial, driven by hand: no Ray is started."""
 
+import errno
+import io
+import math
+import os
+import pickle
 import random
+import re
 import resource
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,7 +18,9 @@ import torch
 
 from pipelines import store
 from pipelines.cluster import here
-from pipelines.store import Checkpoints, StoreError, load_whole, save_atomically, without_replay
+from pipelines.health import DivergedError, check, defined
+from pipelines.seeds import Seeds
+from pipelines.store import Checkpoints, DamagedError, StoreError, load_whole, save_atomically, without_replay
 from pipelines.trainable import RunTrainable
 from rhmc.algorithms import ALGORITHMS
 from rhmc.trainer import Trainer
@@ -112,6 +121,113 @@ def test_a_damaged_checkpoint_falls_back_to_the_one_before(start: Start, tmp_pat
     assert not list((tmp_path / "a" / "run0").glob("*.part"))
 
 
+class Broken(io.BufferedReader):
+    """A file on a disk that fails."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        raise OSError(errno.EIO, "Input/output error")
+
+
+def system(code: int) -> Callable[..., Any]:
+    """What the system refuses."""
+
+    def refuse(*args: Any, **options: Any) -> Any:
+        raise OSError(code, os.strerror(code))
+
+    return refuse
+
+
+def lack(error: Exception) -> Callable[..., Any]:
+    """What torch or zipfile raise."""
+
+    def refuse(*args: Any, **options: Any) -> Any:
+        raise error
+
+    return refuse
+
+
+ALLOCATOR = "[enforce fail at alloc_cpu.cpp:117] err == 0. DefaultCPUAllocator: can't allocate memory: you tried 1 GB"
+SHORTAGES: dict[str, tuple[str, Callable[..., Any], str]] = {  # name -> what is patched, by what, what is said
+    "descriptors of the process": ("pathlib.Path.open", system(errno.EMFILE), "Too many open files"),
+    "descriptors of the system": ("pathlib.Path.open", system(errno.ENFILE), "Too many open files in system"),
+    "rights": ("pathlib.Path.open", system(errno.EACCES), "Permission denied"),
+    "rights of the owner": ("pathlib.Path.open", system(errno.EPERM), "Operation not permitted"),
+    "disk at the first byte": ("pathlib.Path.open", lambda *a: Broken(io.FileIO(a[0])), "Input/output error"),
+    "disk in the middle": ("zipfile.ZipExtFile.read", system(errno.EIO), "Input/output error"),
+    "disk at the end": ("torch.load", system(errno.EIO), "Input/output error"),
+    "memory of the sums": ("zipfile.ZipExtFile.read", lack(MemoryError()), "not enough memory"),
+    "memory of Python": ("torch.load", lack(MemoryError()), "not enough memory"),
+    "memory of torch": ("torch.load", lack(RuntimeError(ALLOCATOR)), "not enough memory"),
+    "memory of torch on Windows": (
+        "torch.load",
+        lack(RuntimeError("not enough memory: you tried")),
+        "not enough memory",
+    ),
+    "a newer format": ("torch.load", lack(pickle.UnpicklingError("Unsupported class x")), "Unsupported class x"),
+}
+
+
+@pytest.mark.parametrize("kind", SHORTAGES)
+def test_a_shortage_touches_no_checkpoint(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    expected = points(finish(start("whole")))
+    first = start()
+    for _ in range(3):
+        first.step()
+    first.cleanup()
+    folder = tmp_path / "a" / "run0"
+    before = {file.name: file.read_bytes() for file in folder.iterdir()}
+    where, what, said = SHORTAGES[kind]
+    with monkeypatch.context() as patch:
+        patch.setattr(where, what)
+        run = start()
+        result = run.step()
+        run.cleanup()
+    assert result["done"]
+    assert "\n" not in result["error"]
+    assert said in result["error"]
+    assert str(folder / "00000003.pt") in result["error"]
+    assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
+    results = finish(start())
+    assert len(results[0]["points"]) == 4  # three from the checkpoint and the new one
+    assert points(results) == expected
+
+
+def test_what_is_damaged_is_kept_under_another_name_until_the_run_is_finished(start: Start, tmp_path: Path) -> None:
+    folder, rng = tmp_path / "a" / "run0", random.Random(3)
+    set_aside: dict[str, bytes] = {}
+    for _ in range(3):
+        run = start()
+        run.step()
+        run.cleanup()
+        newest = max(folder.glob("0*.pt"))
+        set_aside[f"{newest.name}.damaged"] = content = damaged(newest.read_bytes(), "cut short", rng)
+        newest.write_bytes(content)
+        start().cleanup()
+        assert not newest.exists()
+        assert (folder / f"{newest.name}.damaged").read_bytes() == content
+    assert len(list(folder.glob("*.damaged"))) == 1  # always the first checkpoint: its newest damage
+    for point in range(1, 6):
+        (folder / f"{point:08d}.pt").write_bytes(b"no archive")
+    assert Checkpoints(folder).newest() is None
+    assert sorted(file.name for file in folder.iterdir()) == ["00000004.pt.damaged", "00000005.pt.damaged"]
+    assert Checkpoints(folder).points() == 0
+    Checkpoints(folder).clear()
+    assert not folder.exists()
+
+
+def test_checkpoints_of_another_run_are_left_alone(start: Start, tmp_path: Path) -> None:
+    run = start()
+    run.step()
+    run.cleanup()
+    folder = tmp_path / "a" / "run0"
+    shutil.copytree(folder, tmp_path / "a" / "run1")
+    result = start(seed=1).step()
+    assert result["error"] == f"{tmp_path / 'a' / 'run1'}: the checkpoints are of another run; move the folder away"
+    assert (tmp_path / "a" / "run1" / "00000001.pt").read_bytes() == (folder / "00000001.pt").read_bytes()
+
+
 def test_two_damaged_checkpoints_are_a_new_start(start: Start, tmp_path: Path) -> None:
     expected = points(finish(start("whole")))
     first = start()
@@ -131,7 +247,7 @@ def test_any_changed_block_of_a_checkpoint_is_seen(tmp_path: Path) -> None:
         (tmp_path / "x.pt").write_bytes(content[:start] + rng.randbytes(64) + content[start + 64 :])
         try:
             unseen += not same(load_whole(tmp_path / "x.pt"), whole)
-        except Exception:
+        except DamagedError:
             continue
     assert unseen == 0
 
@@ -161,6 +277,120 @@ def test_a_failure_is_a_result(start: Start, tmp_path: Path, monkeypatch: pytest
     result = start("b").step()
     assert result["done"]
     assert str(tmp_path / "b" / "run0") in result["error"]
+
+
+# Values that are not finite
+
+
+@pytest.fixture
+def wild(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, float, int], None]:
+    """Let a metric, or the first weight, become a value at a point."""
+
+    def become(name: str, value: float, number: int) -> None:
+        plain = Trainer.__next__
+
+        def wilder(trainer: Trainer) -> dict[str, float]:
+            metrics = plain(trainer)
+            if trainer.point != number:
+                return metrics
+            if name in metrics:
+                return metrics | {name: value}
+            with torch.no_grad():
+                next(iter(trainer.algorithm.learners()[0].net.parameters())).view(-1)[0] = value
+            return metrics
+
+        monkeypatch.setattr(Trainer, "__next__", wilder)
+
+    return become
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize(
+    ("name", "shown"),
+    [
+        ("train/td_loss", "train/td_loss"),
+        ("eval/return", "eval/return"),
+        ("final/return", "final/return"),
+        ("a weight", "learners.0.net.agents.net.0.weight"),
+    ],
+)
+def test_a_value_that_is_not_finite_fails_the_run_and_is_not_kept(
+    start: Start, tmp_path: Path, wild: Callable[[str, float, int], None], name: str, shown: str, value: float
+) -> None:
+    wild(name, value, at := 3 if name == "final/return" else 2)
+    results = finish(start())
+    last = results[-1]
+    assert last["error"].startswith(f"diverged: {shown} is {value} at step {200 * at}; ")
+    assert (last["diverged"], last["points"]) == (True, [])
+    assert [len(r["points"]) for r in results] == [1] * at + [0]
+    kept = sorted(file.name for file in (tmp_path / "a" / "run0").iterdir())
+    assert kept == [f"{k:08d}.pt" for k in range(max(1, at - 1), at + 1)]  # neither a policy nor a later checkpoint
+
+
+def test_statistics_that_are_not_finite_are_not_kept(start: Start, tmp_path: Path) -> None:
+    run = start(every=2)
+    run.step()
+    trainer = run.trainer
+    assert isinstance(trainer, Trainer)
+    trainer.algorithm.standard.sums[2] = math.inf  # type: ignore[attr-defined]
+    with pytest.raises(DivergedError, match=r"^diverged: algorithm\.standard\.sums is inf at step 0; "):
+        run._save(trainer)
+    assert not (tmp_path / "a" / "run0").exists()
+
+
+def test_a_diverged_run_diverges_again_where_it_did(
+    start: Start, tmp_path: Path, wild: Callable[[str, float, int], None]
+) -> None:
+    wild("train/td_loss", math.nan, 3)
+    first = finish(run := start(every=100))
+    run.cleanup()
+    assert not list((tmp_path / "a" / "run0").glob("*.pt"))
+    again = finish(start(every=100))
+    assert first[-1]["error"] == again[-1]["error"]
+    assert points(first) == points(again)
+    assert len(points(again)) == 3
+
+
+def test_a_step_size_that_diverges(start: Start, tmp_path: Path) -> None:
+    """Nothing is patched here: the weights grow until the loss overflows."""
+    one = spec(lr=1e6, warmup=0)
+    fixed = {"key": "wild", "spec": one.canonical(), "folder": str(tmp_path / "wild"), "stop": str(tmp_path / "stop")}
+    run = RunTrainable({"job": fixed | {"checkpoint_every": 1}})
+    last = finish(run)[-1]
+    assert re.match(r"diverged: train/\w+ is (inf|nan) at step 200; ", last["error"])
+    assert [file.name for file in (tmp_path / "wild").iterdir()] == ["00000001.pt"]
+
+
+@pytest.mark.parametrize("kind", ALGORITHMS)
+def test_every_method_is_finite_at_every_point_and_each_of_its_networks_is_looked_at(kind: str) -> None:
+    """With the settings under which some value is infinite or undefined although nothing is wrong."""
+    few = {"hidden": 4, "batch": 8, "batch_h": 8, "warmup": 0, "steps_per_update": 4, "rollout": 1, "pretrain": 32}
+    config = ALGORITHMS[kind].config
+    algo = config.model_validate({"kind": kind} | {k: v for k, v in few.items() if k in config.model_fields})
+    if "regulator" in config.model_fields:
+        algo = algo.model_copy(update={"regulator": "none"})
+    one = setting().model_copy(update={"algo": algo})
+    trainer = Trainer(one.env.model_copy(update={"agents": 1, "targets": 1}), one.algo, one.trainer, 0)
+    for point in trainer:
+        check(defined(point), trainer.state_dict())
+    for learner in trainer.algorithm.learners():
+        for part in (learner.net, learner.slow):
+            for weight in part.parameters():
+                before = weight.detach().clone()
+                weight.data.view(-1)[-1] = math.nan
+                with pytest.raises(DivergedError, match=r"^diverged: algorithm\.\S+ is nan at step 7; "):
+                    check({"step": 7.0}, trainer.state_dict())
+                weight.data.copy_(before)
+    check({"step": 7.0}, trainer.state_dict())
+
+
+def test_what_has_no_value_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A rollout whose targets are all the same explains nothing of their variance."""
+    assert defined({"train/explained": -math.inf, "train/kl": 0.5}) == {"train/kl": 0.5}
+    assert defined({"train/explained": 0.5}) == {"train/explained": 0.5}
+    values = iter([math.nan, 0.5])
+    monkeypatch.setattr(Trainer, "__next__", lambda _: {"step": 0.0, "train/explained": next(values)})
+    assert next(Seeds(setting(), [1, 2])) == {"step": 0.0, "train/explained": 0.5}
 
 
 def test_a_file_is_durable_before_its_name_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

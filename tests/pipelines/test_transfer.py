@@ -72,7 +72,7 @@ def test_a_policy_that_cannot_act_with_them_is_said() -> None:
     [
         ([], "--agents or --targets: at least one number, such as --agents 2,3,6"),
         (["--agents", "2,x"], "--agents: '2,x': whole numbers with commas between, such as 2,3,6"),
-        (["--targets", "0"], "--targets: '0': numbers from 1 on"),
+        (["--targets", "0"], "--targets: '0': numbers from 1 to 100"),
     ],
 )
 def test_bad_numbers_are_one_line(

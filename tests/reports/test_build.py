@@ -281,7 +281,7 @@ def test_a_study_that_is_not_there(tmp_path: Path) -> None:
 
 def test_faulty_tables_leave_the_old_report(few: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
-    assert len(build(few, out, "quick")) == len(content(out))
+    assert len(build(few, out, "quick").files) == len(content(out))
     before = content(out)
     assert main(["--profile", "paper", "--runs", str(few), "--out", str(out)]) == 2
     lines = capsys.readouterr().err.splitlines()

@@ -96,10 +96,10 @@ def words(points: pd.DataFrame, runs: pd.DataFrame) -> Tables:
         (no_final, "ablation, arm 'full', seed 1, run {run}: marked finished, and final/return is not there"),
         (ghost, "ablation, arm 'full', seed 0, run {first}: marked missing, and has points"),
         (other_profile, "ablation, arm 'full', seed 0: made with profile 'paper', and this report is of 'quick'"),
-        (odd_status, "ablation, arm 'full', seed 0: status 'done' is none of finished, partial, missing"),
+        (odd_status, "ablation, arm 'full', seed 0: status 'done' is none of finished, failed, partial, missing"),
         (no_config, "ablation, arm 'full', seed 0: column 'config' is no JSON object"),
         (no_column, "ablation.parquet: no column 'value'; there are study, arm, seed, run, step, metric"),
-        (words, "ablation.parquet: column 'value' holds str, not numbers"),
+        (words, "ablation.parquet: column 'value' holds words, not numbers"),
     ],
 )
 def test_a_planted_fault_is_one_line(tmp_path: Path, plant: Plant, line: str) -> None:

@@ -187,7 +187,7 @@ def test_what_a_cell_is_sorted_by(text: str, key: str) -> None:
 
 
 def test_words_are_escaped_and_breaks_kept() -> None:
-    assert page.cell("a<b><br>c & d").text == "a&lt;b&gt;<br>c &amp; d"
+    assert page.cell("a<b>\nc & d").text == "a&lt;b&gt;<br>c &amp; d"
 
 
 @pytest.mark.parametrize(("seconds", "words"), [(0, "0 s"), (89, "89 s"), (95, "2 min"), (11_530, "3 h 12 min")])
