@@ -11,7 +11,7 @@ import sys
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
@@ -55,12 +55,30 @@ def _visible() -> Iterator[None]:
 
 app = typer.Typer(
     cls=Verbs,
-    help="Reproduce a multi-agent coordination paper: run studies, score yardsticks, build the report.",
     epilog=EXIT_CODES,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
 RESULTS, CODE = "Results", "This installation"
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        print(f"rhmc {version('rhmc')}, Python {sys.version.split()[0]}, torch {version('torch')}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Say which versions these are.")
+    ] = False,
+) -> None:
+    """Reproduce a multi-agent coordination paper: run studies, score yardsticks, build the report."""
+
+
 app.add_typer(study.app, name="study")
 app.add_typer(search.app, name="search")
 app.add_typer(yardsticks.app, name="yardsticks")

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -559,6 +560,12 @@ def die(bank: yardsticks.Bank) -> None:
 
 
 # The rest
+
+
+def test_versions_are_said(rhmc: Rhmc) -> None:
+    code, out, err = rhmc("--version")
+    assert (code, err) == (0, "")
+    assert out.startswith(f"rhmc {version('rhmc')}, Python 3.")
 
 
 def test_fingerprint_is_printed_or_written_where_it_differs(rhmc: Rhmc) -> None:
