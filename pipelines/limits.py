@@ -4,9 +4,10 @@ together. The configurations of the science package say what is right; this says
 
 import re
 from collections.abc import Iterable, Iterator
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
-from pydantic import BaseModel
+if TYPE_CHECKING:  # help, which shows bounds, answers without it
+    from pydantic import BaseModel
 
 MOST = 10**9  # of a number that has no bound of its own
 SEED = 10**12  # what is added to a seed must not leave 64 bits
@@ -64,7 +65,7 @@ def beyond(name: str, value: Any) -> str:
     return ""
 
 
-def numeric(model: type[BaseModel]) -> Iterator[str]:
+def numeric(model: "type[BaseModel]") -> Iterator[str]:
     """The fields of a model that take a number."""
     for name, field in model.model_fields.items():
         if {int, float} & ({field.annotation} | set(get_args(field.annotation))):

@@ -550,9 +550,14 @@ def census(home: Home) -> list[Counted] | None:
 def open_existing(study: StudyCard, home: Home) -> MlflowTracker | None:
     """The log for reading; None where there is no database yet (MLflow would make one)."""
     uri = tracking_uri(home)
-    if uri.startswith("sqlite:") and (not sqlite_file(uri).exists() or sqlite_file(uri).stat().st_size == 0):
+    if uri.startswith("sqlite:") and _empty(sqlite_file(uri)):
         return None
     return MlflowTracker(study, home, write=False)
+
+
+def _empty(file: Path) -> bool:
+    """Whether there is no database yet; a device or a pipe in its place is none and never will be."""
+    return not file.exists() or (file.is_file() and file.stat().st_size == 0)
 
 
 def prepared(home: Home) -> str:

@@ -66,6 +66,7 @@ class Abandoned(io.FileIO):
 
 def lost() -> str:
     """Why what was printed on stdout is not all there; nothing if it is, or if nobody wanted more of it."""
+    sys.stderr.flush()
     sys.stdout.flush()
     raw = getattr(getattr(sys.stdout, "buffer", None), "raw", None)
     return raw.lost if isinstance(raw, Abandoned) else ""

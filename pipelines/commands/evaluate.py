@@ -22,7 +22,7 @@ from pipelines.limits import BOUNDS, EPISODES, JOBS, SEED
 
 CHECKPOINT = ".pt"
 Arms = Annotated[list[str] | None, typer.Option(help="Only this arm. Can be given several times.")]
-Seeds = Annotated[list[int] | None, typer.Option(help="Only this seed. Can be given several times.")]
+Seeds = Annotated[list[int] | None, typer.Option(min=0, max=SEED, help="Only this seed. Can be given several times.")]
 Out = Annotated[Path, typer.Option(help="Folder of the tables that the report reads; made if it is not there.")]
 
 

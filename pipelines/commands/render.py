@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pipelines.commands.common import Profile, Variant, tell
+from pipelines.limits import SEED
 
 if TYPE_CHECKING:
     from pipelines.policy import Saved
@@ -30,7 +31,7 @@ def render(
     profile: Profile = "quick",
     variant: Variant = None,
     arm: Annotated[str | None, typer.Option(help="Of a study.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Of a study.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, max=SEED, help="Of a study.")] = None,
 ) -> None:
     """Draw one episode of a trained policy as an animation."""
     from pipelines.errors import InputError

@@ -93,9 +93,9 @@ def _serve(uri: str, artifacts: Path, port: int, saved: Iterable[tuple[str, str,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
     )
-    talk = Thread(target=_write_down, args=(server, log), daemon=True)
-    talk.start()
     try:
+        talk = Thread(target=_write_down, args=(server, log), daemon=True)
+        talk.start()
         if _answers(server, port):
             _tell(port, saved)
         code = server.wait()

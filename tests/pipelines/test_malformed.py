@@ -9,7 +9,7 @@ from tests.pipelines.malformed import WRONG, Case, Outcome, Runner, cases, judge
 
 SEED = 1
 CASES = cases(SEED)
-KINDS = ("included files", "paths that are no files", "by chance")
+KINDS = ("names", "search files", "included files", "paths that are no files", "paper.yaml", "by chance")
 
 
 @pytest.fixture(scope="module")
