@@ -43,7 +43,7 @@ class Files(NamedTuple):
     """The files of a bundle."""
 
     sizes: Mapping[str, int]  # bytes by name, as the bundle tells
-    open: Callable[[str], IO[bytes]]
+    reader: Callable[[str], IO[bytes]]
 
     def blocks(self, name: str) -> Iterator[bytes]:
         """The content of a file.
@@ -52,7 +52,7 @@ class Files(NamedTuple):
             BundleError: it cannot be read, or has another size than the bundle tells.
         """
         left = self.sizes[name]
-        with _readable(name), self.open(name) as file:
+        with _readable(name), self.reader(name) as file:
             while block := file.read(BLOCK):
                 left -= len(block)
                 if left < 0:

@@ -244,8 +244,8 @@ def _table(files: Files, name: str, schema: pa.Schema) -> pa.Table:
     texts = [field.name for field in schema if field.type == pa.string()]
     try:
         source = pa.BufferReader(files.read(name))
+        _check_head(name, pq.ParquetFile(source), schema, texts)
         table = pq.ParquetFile(source, read_dictionary=texts)
-        _check_head(name, table, schema, texts)
         content = table.read(use_threads=False)
         content.validate(full=True)
     except (OSError, ValueError, KeyError, MemoryError, pa.ArrowException) as error:

@@ -9,7 +9,19 @@ from pathlib import Path
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
-from sqlalchemy import ColumnElement, Connection, String, column, create_engine, func, literal, select, table, update
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    String,
+    column,
+    create_engine,
+    func,
+    inspect,
+    literal,
+    select,
+    table,
+    update,
+)
 from sqlalchemy.pool import NullPool
 
 from pipelines import sqlite
@@ -75,6 +87,8 @@ def bring_up_to_date(uri: str, home: Home) -> None:
     engine = create_engine(uri, poolclass=NullPool, connect_args=sqlite.connecting(uri))
     try:
         with engine.connect() as database:
+            if not inspect(database).has_table("experiments"):  # nobody has used it yet
+                return
             moved = [stored for stored in _locations(database) if _of_moved(database, stored, home, own=own)]
             for stored in moved:
                 _rename(database, stored, home.artifacts.as_uri())

@@ -30,15 +30,23 @@ def patient(stream: IO[str] | None, number: int) -> IO[str]:
     """A standard stream that takes everything: letters that it cannot say are escaped, a reader that left is no error.
 
     Args:
-        stream: as Python made it; None where it was closed from the start.
+        stream: as Python made it; None where it was closed from the start. One of somebody else's stays.
         number: of its descriptor.
     """
-    if not isinstance(stream, io.TextIOWrapper):
+    if not isinstance(stream, io.TextIOWrapper) or not _is(stream, number):
         return stream or open(os.devnull, "w", encoding="utf-8")
     stream.flush()
     raw = Abandoned(number, "wb", closefd=False)
     lines = stream.line_buffering
     return io.TextIOWrapper(io.BufferedWriter(raw), stream.encoding, "backslashreplace", line_buffering=lines)
+
+
+def _is(stream: IO[str], number: int) -> bool:
+    """Whether a stream is that of a descriptor, and not what somebody has put in its place."""
+    try:
+        return stream.fileno() == number
+    except (OSError, ValueError):
+        return False
 
 
 class Abandoned(io.FileIO):

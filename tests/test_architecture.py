@@ -274,7 +274,9 @@ def test_every_study_is_in_the_pipeline(stages: dict) -> None:
     """A search is run by hand: what it finds is kept in `studies/found`, and a study that includes it is here."""
     studies = {p.stem for p in (ROOT / "studies").glob("*.yaml") if not is_search(p)} - {FOR_COPYING}
     stage, queue = stages["studies"], stages["vars"]["queue"].split()
-    assert [command.split()[-3:] for command in stage["cmd"]] == [["${queue}", "--profile", "${profile}"]] * 2
+    check, *commands = stage["cmd"]
+    assert check == "rhmc profile"
+    assert [command.split()[-3:] for command in commands] == [["${queue}", "--profile", "${profile}"]] * 2
     assert unmatched("dvc.yaml", {f"studies/{name}.yaml" for name in studies}, queue) == []
     tables = {f"reports/${{profile}}/runs/{name}{kind}.parquet" for name in studies for kind in ("", ".runs")}
     assert unmatched("dvc.yaml", tables, [next(iter(out)) for out in stage["outs"]]) == []

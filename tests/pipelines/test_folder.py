@@ -27,7 +27,7 @@ from pipelines.search import Search
 from pipelines.search_run import show_search
 from pipelines.store import Home, StoreError, work_folder
 from pipelines.trials import Ledger, look, open_storage, opened
-from rhmc.trainer import Trainer
+from rhmc.trainer import Trainer, grid_step
 from tests.pipelines.support import setting, tiny
 
 HOSTILE = "#x ?y %2F z'\"~{a}\n"
@@ -52,7 +52,8 @@ def log(home: Path, arm: int) -> str:
     tracker = MlflowTracker(study_card(STUDY), Home(home))
     item = items(STUDY, "abc")[arm]
     logged = tracker.start(item.card)
-    logged.log([{"step": 600.0, "eval/return": 1.0, "final/return": 2.0}])
+    steps = [grid_step(item.spec.trainer, point) for point in range(4)]
+    logged.log([*({"step": float(step), "eval/return": 1.0} for step in steps), {"step": 600.0, "final/return": 2.0}])
     logged.text("config.yaml", "a: 1\n")
     trainer = Trainer(item.spec.env, item.spec.algo, item.spec.trainer, item.spec.seed)
     save(home / FILE, Saved(item.spec, trainer.state_dict()["algorithm"]))

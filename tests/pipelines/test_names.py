@@ -181,7 +181,8 @@ def test_all_that_the_program_writes_beside_the_tables_is_reserved() -> None:
     made = {Path(out).name.partition(".")[0] for out in outs if "/runs/" in out and not out.endswith(".gif")}
     studies = {file.stem for file in (ROOT / "studies").glob("*.yaml")}
     assert made - studies == set(RESERVED)
-    found = {name for file in (ROOT / "pipelines").glob("*.py") if file.name != "bundle.py" for name in tables_in(file)}
+    files = [file for file in (ROOT / "pipelines").glob("*.py") if not file.name.startswith("bundle")]
+    found = {name for file in files for name in tables_in(file)}
     assert found == set(RESERVED)
 
 
@@ -468,8 +469,9 @@ def test_a_work_folder_that_is_too_long_is_one_line(monkeypatch: pytest.MonkeyPa
     written(["a"])
     for verb in (["study", "run"], ["study", "status"], ["export"]):
         said = rhmc(*verb, "studies/x.yaml")
-        assert (said.code, len(said.err.splitlines())) == (2, 1)
-        assert "File name too long" in said.err
+        (line,) = (line for line in said.err.splitlines() if not line.startswith("note: "))
+        assert said.code == 2
+        assert "File name too long" in line
 
 
 def test_a_nul_in_the_path_of_an_include() -> None:

@@ -1,5 +1,6 @@
 """Policies that were saved: read back they act as they did, also out of MLflow's registry in another process."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -151,7 +152,7 @@ LOAD = """
 import sys, torch
 import mlflow
 mlflow.set_tracking_uri(sys.argv[1])
-model = mlflow.pyfunc.load_model("models:/demo-quick-no-filter-1@seed-5")
+model = mlflow.pyfunc.load_model(f"models:/{sys.argv[4]}@seed-5")
 seen = torch.load(sys.argv[2], weights_only=True)
 torch.save([torch.from_numpy(model.predict({k: v.numpy() for k, v in obs.items() if v.numel()})) for obs in seen],
            sys.argv[3])
@@ -167,7 +168,8 @@ def test_a_registered_policy_acts_in_a_fresh_process_as_the_trainer_evaluates(ho
     log.model(tmp_path / "policy.pt")
     log.model(tmp_path / "policy.pt")
     (version,) = tracker.client.search_model_versions()
-    assert (version.name, version.run_id, version.tags["seed"]) == ("demo-quick-no-filter-1", log.ref, "5")
+    assert re.fullmatch("demo-quick-no-filter-1-[0-9a-f]{8}", version.name)
+    assert (version.run_id, version.tags["seed"]) == (log.ref, "5")
     tracker.start(CARD._replace(seed=6, spec_id="0ther")).model(tmp_path / "policy.pt")
     versions = tracker.client.search_model_versions(f"name = '{version.name}'")
     assert sorted(int(v.version) for v in versions) == [1, 2]
@@ -177,6 +179,7 @@ def test_a_registered_policy_acts_in_a_fresh_process_as_the_trainer_evaluates(ho
     seen, done = episode(trainer)
     torch.save([obs._asdict() for obs in seen], tmp_path / "seen.pt")
     words = [sys.executable, "-W", "ignore", "-c", LOAD, tracker.uri, str(tmp_path / "seen.pt"), str(tmp_path / "a.pt")]
+    words.append(version.name)
     subprocess.run(words, check=True)
     actions = torch.load(tmp_path / "a.pt", weights_only=True)
     assert len(actions) == len(done)

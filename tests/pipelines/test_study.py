@@ -580,7 +580,7 @@ def test_files_that_cannot_be_read() -> None:
         ("studies/y.yaml", "studies/y.yaml: no such file; did you mean 'studies/x.yaml'?"),
         ("x.yaml", "x.yaml: no such file; did you mean 'studies/x.yaml'?"),
         ("studies", "studies: a directory; give one study of it: x.yaml"),
-        ("/dev/zero", "/dev/zero: larger than 1000000 bytes; a study is a short text"),
+        ("/dev/zero", "/dev/zero: a device, and a regular file is needed"),
     ]:
         with pytest.raises(StudyError) as caught:
             Study.load(path)
