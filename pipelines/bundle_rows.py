@@ -388,9 +388,18 @@ def _spec(where: str, config: str) -> RunSpec:
     numbers = {name: value for name, value in flatten(spec.model_dump()).items() if isinstance(value, float)}
     if astray := [name for name, value in numbers.items() if not math.isfinite(value)]:
         raise BundleError(f"{where}: config: {astray[0]}: {numbers[astray[0]]} is not allowed; must be a finite number")
+    if not _within(json.loads(config), json.loads(spec.canonical())):
+        raise BundleError(f"{where}: config: {show(config)} is not allowed; must be as the settings are written")
     if fault := misfit(spec.env, spec.algo):
         raise BundleError(f"{where}: config: env: {fault}")
     return spec
+
+
+def _within(part: Any, whole: Any) -> bool:
+    """Whether all that is given is there as it is given, so that nothing was read as something else."""
+    if isinstance(part, dict) and isinstance(whole, dict):
+        return part.keys() <= whole.keys() and all(_within(value, whole[key]) for key, value in part.items())
+    return type(part) is type(whole) and bool(part == whole)
 
 
 def _check_params(where: str, params: dict[str, str], spec: RunSpec) -> None:

@@ -122,7 +122,7 @@ def test_the_page_of_the_command_line_names_every_verb() -> None:
     ("line", "offered"),
     [
         ("rhmc st", {"study"}),
-        ("rhmc study ", {"check", "run", "status", "list", "export", "import"}),
+        ("rhmc study ", {"check", "run", "status", "list", "export", "import", "adopt"}),
         ("rhmc study run studies/al", {"studies/alpha.yaml"}),
         ("rhmc study run studies/alpha.yaml --profile q", {"quick"}),
         ("rhmc search run studies/", {"studies/search_rhmc.yaml"}),
@@ -212,7 +212,7 @@ def test_status_for_scripts(rhmc: Rhmc) -> None:
     none = {"planned": 2, "finished": 0, "running": 0, "interrupted": 0, "failed": 0, "missing": 2, "stale": 0}
     assert (said.code, said.err) == (1, "")
     arms = {"full": none, "none": none}
-    expected = {"study": "x", "profile": "quick", "finished": False, "arms": arms, "errors": {}}
+    expected = {"study": "x", "profile": "quick", "finished": False, "arms": arms, "errors": {}, "stale": []}
     assert json.loads(said.out) == expected
 
 

@@ -711,7 +711,9 @@ def test_status_before_anything_ran_makes_nothing(tmp_path: Path, capsys: pytest
 def test_trials_of_other_code_are_stale(tmp_path: Path) -> None:
     world = World(load(), tmp_path)
     world.launch()
-    ledger, stale = look(world.search, "IQL", "0ther", world.storage)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pipelines.search.code_id", lambda *place: "0ther")
+        ledger, stale = look(world.search, "IQL", world.storage)
     assert (ledger.closed, stale) == (0, 5)
     ledger, stale = look(world.search, "IQL", world.storage)
     assert (ledger.closed, stale) == (5, 0)
