@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import pytest
 from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 from ruamel.yaml import YAML
 
 from pipelines.study import Study
@@ -344,8 +345,8 @@ def locked() -> dict[str, str]:
 def test_the_lock_holds_every_direct_dependency_within_its_range() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     direct = list(map(Requirement, project["dependencies"] + project["optional-dependencies"]["test"]))
-    lock = {name.lower(): version for name, version in locked().items()}
-    outside = [str(one) for one in direct if not one.specifier.contains(lock.get(one.name.lower(), "0"))]
+    lock = {canonicalize_name(name): version for name, version in locked().items()}
+    outside = [str(one) for one in direct if not one.specifier.contains(lock.get(canonicalize_name(one.name), "0"))]
     assert outside == []
     assert [one.name for one in direct if not one.specifier] == []
 
