@@ -278,6 +278,7 @@ def test_a_server_of_this_machine_is_asked_past_a_proxy(
     proxies = {"http_proxy": "http://127.0.0.1:9", "no_proxy": "", "NO_PROXY": ""}
     for name, value in proxies.items():
         monkeypatch.setenv(name, value)
+    monkeypatch.setattr(urllib.request, "_opener", None)  # it remembers the proxies of when it was first used
     with another_server() as port:
         with pytest.raises(OSError, match=r"refused|proxy"):
             ask(f"http://127.0.0.1:{port}/")
