@@ -127,6 +127,6 @@ def test_an_examination_goes_on_after_a_fault(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(doctor, "LOCK", tmp_path / "none")
     monkeypatch.setattr(doctor, "requires", lambda name: ["torch==0.1", 'x==1; extra == "test"'])
     found = list(examine(tmp_path, ray=False))
-    assert [one.what for one in found] == ["python", "libraries", "torch", "code", "work folder", "store"]
+    assert [one.what for one in found] == ["python", "libraries", "torch", "arithmetic", "code", "work folder", "store"]
     assert found[1].level == "fault"
     assert str(sys.executable) in found[0].text
