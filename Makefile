@@ -1,6 +1,7 @@
-# `make repro` makes the results, `make test` checks everything. Both set themselves up with Python 3.11, git and make.
+# `make repro` makes the results, `make test` checks everything. Both set themselves up with Python 3.11
+# (the published results'), 3.12 or 3.13, git and make.
 #
-#   PYTHON=...           the Python 3.11 to use, where `python3.11` is not on the path
+#   PYTHON=...           the Python to use, where `python3.11` is not on the path
 #   PIP_TORCH_ARGS=...   options for the installation of torch alone, such as the index that has its CPU build
 #   JOBS=2               tests at once
 #   KILLS=60 SEED=0      of `make soak`
@@ -14,8 +15,8 @@ PIP_TORCH_ARGS ?=
 JOBS ?= 2
 KILLS ?= 60
 SEED ?= 0
-IS_311 := -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))'
-PYTHON ?= $(shell for p in python3.11 python3; do $$p $(IS_311) 2>/dev/null && echo $$p && break; done)
+FITS := -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))'
+PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do $$p $(FITS) 2>/dev/null && echo $$p && break; done)
 READY := .venv/.ready
 
 # The environment's own programs first: `rhmc` in a DVC stage is this project's.
@@ -72,9 +73,10 @@ clean: ## Remove .venv and caches; results stay
 
 # torch comes first and alone, so that a build with CUDA is seen before its packages are fetched.
 $(READY): requirements.lock pyproject.toml
-	@test -n "$(PYTHON)" || { echo "Python 3.11 is needed: no python3.11 here, and python3 is another version." \
+	@test -n "$(PYTHON)" || { echo "Python 3.11, 3.12 or 3.13 is needed, and none is on the path." \
 	  "Give its path: make PYTHON=/path/to/python3.11"; exit 1; }
-	@$(PYTHON) $(IS_311) || { echo "Python 3.11 is needed, and $(PYTHON) is another version."; exit 1; }
+	@$(PYTHON) $(FITS) || { echo "Python 3.11, 3.12 or 3.13 is needed, and $(PYTHON) is none of them." \
+	  "Give the path of one: make PYTHON=/path/to/python3.11"; exit 1; }
 	@echo "Setting up .venv: some minutes, 2.3 GB"
 	@test -x .venv/bin/python || $(PYTHON) -m venv .venv
 	@python -m pip install --quiet --no-deps $(PIP_TORCH_ARGS) "$$(grep '^torch==' requirements.lock)"

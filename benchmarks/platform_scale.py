@@ -157,7 +157,6 @@ def now() -> list[float]:
 
 def fill(file: Path, home: Path, leave: int) -> int:
     """Copy a finished run to all planned ones that are not logged, but for the last few; returns how many."""
-    from pipelines.fingerprint import fingerprint
     from pipelines.mlflow_tracker import open_existing
     from pipelines.plan import commit, items, study_card
     from pipelines.store import Home
@@ -167,7 +166,7 @@ def fill(file: Path, home: Path, leave: int) -> int:
     assert tracker is not None
     there = {(run.arm, run.key): run for run in tracker.recorded()}
     model = next(run.ref for run in there.values() if run.status == "finished")
-    todo = [item for item in items(study, fingerprint(), commit()) if (item.card.arm, item.key) not in there]
+    todo = [item for item in items(study, commit()) if (item.card.arm, item.key) not in there]
     with closing(sqlite3.connect(home / "mlflow.db")) as database:
         copies = {table: Rows(database, table, model) for table in ("runs", "tags", "params", *METRICS)}
         for i, item in enumerate(todo[: len(todo) - leave]):

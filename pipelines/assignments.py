@@ -13,7 +13,6 @@ from torch import Tensor
 
 from pipelines.errors import InputError
 from pipelines.export import METRICS, read_parquet, write_parquet
-from pipelines.fingerprint import fingerprint
 from pipelines.plan import Item, chosen, items
 from pipelines.side_by_side import side_by_side
 from pipelines.study import Study
@@ -104,7 +103,7 @@ def watched(study: Study, arms: Sequence[str] = (), seeds: Sequence[int] = (), j
         InputError: there is no such arm, or none of the runs assigns targets.
         StoreError: one of the processes was killed.
     """
-    found = [item for item in chosen(study, fingerprint(), arms, seeds) if item.spec.algo.kind in ASSIGNING]
+    found = [item for item in chosen(study, arms, seeds) if item.spec.algo.kind in ASSIGNING]
     if not found:
         raise InputError(f"{study.name} ({study.profile}): no such run assigns targets; {' and '.join(ASSIGNING)} do")
     for item, points in zip(found, side_by_side(_train, found, jobs), strict=True):
@@ -136,7 +135,7 @@ def export_assignments(study: Study, rows: Sequence[Row], out: Path) -> Path:
     """
     file = out / f"{study.name}{SUFFIX}"
     new = {row[3] for row in rows}
-    known = {item.card.spec_id for item in items(study, fingerprint(), "")}
+    known = {item.card.spec_id for item in items(study)}
     there = [tuple(row[name] for name in METRICS.names) for row in read_parquet(file, METRICS, "assignments")]
     kept = [row for row in there if row[3] in known - new]
     write_parquet(file, METRICS, sorted([*kept, *rows], key=lambda row: row[:6]))

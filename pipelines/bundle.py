@@ -25,14 +25,14 @@ from pipelines.bundle_files import MANIFEST, BundleError, Files, limited, opened
 from pipelines.bundle_rows import FORMAT, POINTS, RUNS, Entry, Manifest, Told, read
 from pipelines.bundle_states import check_states, states_of
 from pipelines.export import write_parquet
-from pipelines.fingerprint import fingerprint
+from pipelines.identity import present
 from pipelines.litter import part_of
 from pipelines.plan import Item, commit, finished, items, resolved_yaml, study_card
 from pipelines.policy import CONFIG, FILE
 from pipelines.recorder import keep
 from pipelines.store import Checkpoints, Home, StoreError, whole
 from pipelines.study import Study
-from pipelines.tracker import VALUES_ONLY, Recorded, StudyCard, Tracker
+from pipelines.tracker import ADOPTED, VALUES_ONLY, Recorded, StudyCard, Tracker
 
 ARCHIVE = ".zip"
 DESK = "import"
@@ -49,14 +49,14 @@ class Packed(NamedTuple):
 
 
 class Taken(NamedTuple):
-    """What came of a bundle, in runs; `foreign` is the fingerprint of its code where that is not the code here."""
+    """What came of a bundle, in runs; `foreign` of them were made by code that is not the code here."""
 
     study: str
     profile: str
     new: int
     known: int
     begun: int
-    foreign: str
+    foreign: int
 
 
 # Packing
@@ -80,13 +80,16 @@ def pack(study: Study, out: Path, home: Path, *, values_only: bool = False) -> P
         raise StoreError(f"{out}: is there already; name a new one")
     place, card = Home(home), study_card(study)
     tracker = open_existing(card, place)
-    plan = items(study, fingerprint(), "")
+    plan = items(study)
     with whole(out) as part, _beside(part, out) as folder:
         packed = _fill(folder, plan, tracker, place, values_only)
         if packed.finished + packed.begun == 0:
             raise StoreError(f"{study.name} ({study.profile}): no run is finished or under way; nothing to export")
         runs = tuple((item.card.arm, item.key) for item in plan)
-        about = Manifest(format=FORMAT, fingerprint=fingerprint(), commit=commit(), plan=runs, **card._asdict())
+        code = {item.card.fingerprint: dict(item.card.modules) for item in plan}
+        adopted = {run.key: run.adopted for run in tracker.recorded() if run.adopted} if tracker else {}
+        adopted = {item.key: adopted[item.key] for item in plan if item.key in adopted}
+        about = Manifest(format=FORMAT, commit=commit(), plan=runs, code=code, adopted=adopted, **card._asdict())
         (folder / MANIFEST).write_text(about.model_dump_json(indent=1) + "\n", encoding="utf-8")
         _check_packed(folder, out)
         if folder != part:
@@ -240,18 +243,19 @@ def _take_in(told: Told, study: StudyCard, home: Home, stock: Stock) -> Taken:
             new = [entry for entry in told.entries if entry.finished and entry.place not in known]
             begun = [entry for entry in further if entry.place not in known]
             for entry in new:
-                _log(tracker, study, entry, stock)
+                _log(tracker, study, entry, stock, told.about.adopted.get(entry.key, ""))
             for entry in begun:
                 _lay_out(tracker, there.get(entry.place), home, entry, stock)
             complete = told.plan is not None and told.plan <= finished(tracker.recorded())
         finally:
             tracker.close("finished" if complete else "interrupted")
-    foreign = "" if told.about.fingerprint == fingerprint() else told.about.fingerprint
+    here = present()
+    foreign = sum(entry.item.card.fingerprint not in here for entry in told.entries)
     total = sum(entry.finished for entry in told.entries)
     return Taken(study.study, study.profile, len(new), total - len(new), len(begun), foreign)
 
 
-def _log(tracker: Tracker, study: StudyCard, entry: Entry, stock: Stock) -> None:
+def _log(tracker: Tracker, study: StudyCard, entry: Entry, stock: Stock, adopted: str) -> None:
     log = tracker.start(entry.item.card)
     log.log(entry.values.points())
     config = resolved_yaml(entry.item, study)
@@ -263,6 +267,8 @@ def _log(tracker: Tracker, study: StudyCard, entry: Entry, stock: Stock) -> None
             (Path(name) / CONFIG).write_text(config, encoding="utf-8")  # for a policy without its spec
             stock.copy(entry.files, Path(name) / FILE)
             keep(log, Path(name))
+    if adopted:
+        log.tag(ADOPTED, adopted)
     log.finish("finished")
 
 

@@ -81,6 +81,7 @@ def metric_fault(metric: str) -> str:
 
 Digest = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{12}$")]
 Key = Annotated[str, StringConstraints(pattern=f"^{KEY}$")]
+Module = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][\w.]*$")]
 Commit = Annotated[str, StringConstraints(pattern=r"^([0-9a-f]{3,64}(-dirty)?|unknown)?$")]
 Seal = Annotated[str, StringConstraints(pattern=r"^([0-9a-f]{64})?$")]  # of a file
 Arm = Annotated[str, AfterValidator(partial(_sound, arm_fault))]
@@ -101,9 +102,11 @@ class Manifest(Frozen):
     note: Text
     params: dict[Method, tuple[Setting, ...]]
     arms: tuple[Arm, ...] = Field(min_length=1)
-    fingerprint: Digest
+    fingerprint: Digest | None = None  # of all the code, in format 2: later a run's key has that of its own
     commit: Commit
     plan: tuple[tuple[Arm, Key], ...] = ()  # every run of the study, in the bundle or not
+    code: dict[Digest, dict[Module, Digest]] = Field(default_factory=dict)  # the modules of each code that made a run
+    adopted: dict[Key, Text] = Field(default_factory=dict)  # runs that older code made: which, and what was compared
 
     @model_validator(mode="after")
     def _whole(self) -> "Manifest":
@@ -111,6 +114,8 @@ class Manifest(Frozen):
             raise ValueError("arms: one of them is there twice")
         if bool(self.plan) != (self.format == FORMAT):
             raise ValueError(f"plan: must name the runs of the study, in format {FORMAT} alone")
+        if (self.fingerprint is None) != (self.format == FORMAT):
+            raise ValueError(f"fingerprint: must be there in formats before {FORMAT} alone")
         return self
 
 
@@ -152,6 +157,7 @@ class Entry(NamedTuple):
     finished: bool
     policy: str  # SHA-256 of its file, empty without one
     values: Values
+    key: str  # in the bundle, whose format may name runs otherwise
 
     @property
     def place(self) -> tuple[str, str]:
@@ -161,7 +167,7 @@ class Entry(NamedTuple):
     @property
     def files(self) -> str:
         """How the names of its files begin."""
-        return f"policies/{self.item.key}.pt" if self.finished else f"checkpoints/{self.item.key}/"
+        return f"policies/{self.key}.pt" if self.finished else f"checkpoints/{self.key}/"
 
 
 class Told(NamedTuple):
@@ -343,20 +349,31 @@ def _each(column: np.ndarray, name: str, fine: np.ndarray, rule: str) -> None:
 def _entry(about: Manifest, at: int, run: Run, values: Values) -> Entry:
     where = f"{bundle_files.RUNS}: row {at}"
     spec = _spec(where, run.config)
-    if run.key != (key := f"{spec.id}-{about.fingerprint}"):
-        raise BundleError(f"{where}: key: {run.key} is not allowed; of these settings and this code it is {key}")
+    code = _code(where, about, run, spec)
     if run.seed != spec.seed:
         raise BundleError(f"{where}: seed: {run.seed} is not allowed; of these settings it is {spec.seed}")
     if run.arm not in about.arms:
         raise BundleError(f"{where}: arm: {show(run.arm)} is not among the arms of {MANIFEST}")
     _check_params(where, run.params, spec)
     card = Card(
-        run.arm, spec.seed, spec.id, about.fingerprint, spec.algo.kind, spec.env.kind, run.commit, run.params,
-        imported=_origin(run, values),
+        run.arm, spec.seed, spec.id, code, spec.algo.kind, spec.env.kind, run.commit, run.params,
+        modules=about.code.get(code, {}), imported=_origin(run, values),
     )  # fmt: skip
-    entry = Entry(Item(card, spec, about.study), run.finished, run.policy, values)
+    entry = Entry(Item(card, spec, about.study), run.finished, run.policy, values, run.key)
     _check_curve(where, entry)
     return entry
+
+
+def _code(where: str, about: Manifest, run: Run, spec: RunSpec) -> str:
+    """The code that made a run, from its key, whose other part has to be that of its settings."""
+    code = run.key.rpartition("-")[2]
+    if about.fingerprint is None:
+        key = f"{spec.id}-{code}"
+    else:  # it named settings by their whole text
+        key = f"{hashlib.sha256(run.config.encode()).hexdigest()[:12]}-{about.fingerprint}"
+    if run.key != key:
+        raise BundleError(f"{where}: key: {run.key} is not allowed; of these settings and this code it is {key}")
+    return code
 
 
 def _spec(where: str, config: str) -> RunSpec:
@@ -371,11 +388,18 @@ def _spec(where: str, config: str) -> RunSpec:
     numbers = {name: value for name, value in flatten(spec.model_dump()).items() if isinstance(value, float)}
     if astray := [name for name, value in numbers.items() if not math.isfinite(value)]:
         raise BundleError(f"{where}: config: {astray[0]}: {numbers[astray[0]]} is not allowed; must be a finite number")
-    if spec.canonical() != config:
-        raise BundleError(f"{where}: config: {show(config)} is not allowed; must be in full and sorted")
+    if not _within(json.loads(config), json.loads(spec.canonical())):
+        raise BundleError(f"{where}: config: {show(config)} is not allowed; must be as the settings are written")
     if fault := misfit(spec.env, spec.algo):
         raise BundleError(f"{where}: config: env: {fault}")
     return spec
+
+
+def _within(part: Any, whole: Any) -> bool:
+    """Whether all that is given is there as it is given, so that nothing was read as something else."""
+    if isinstance(part, dict) and isinstance(whole, dict):
+        return part.keys() <= whole.keys() and all(_within(value, whole[key]) for key, value in part.items())
+    return type(part) is type(whole) and bool(part == whole)
 
 
 def _check_params(where: str, params: dict[str, str], spec: RunSpec) -> None:

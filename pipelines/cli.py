@@ -11,14 +11,14 @@ import sys
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
 from pipelines import streams
 from pipelines.addresses import reach_loopback, scrubbed
-from pipelines.commands import doctor, evaluate, render, science, search, study, ui, yardsticks
+from pipelines.commands import doctor, evaluate, render, science, search, study, ui, verify, yardsticks
 from pipelines.commands.common import BAD, INTERRUPTED, UNFINISHED
 from pipelines.errors import InputError, visible
 
@@ -55,12 +55,30 @@ def _visible() -> Iterator[None]:
 
 app = typer.Typer(
     cls=Verbs,
-    help="Reproduce a multi-agent coordination paper: run studies, score yardsticks, build the report.",
     epilog=EXIT_CODES,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
 RESULTS, CODE = "Results", "This installation"
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        print(f"rhmc {version('rhmc')}, Python {sys.version.split()[0]}, torch {version('torch')}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Say which versions these are.")
+    ] = False,
+) -> None:
+    """Reproduce a multi-agent coordination paper: run studies, score yardsticks, build the report."""
+
+
 app.add_typer(study.app, name="study")
 app.add_typer(search.app, name="search")
 app.add_typer(yardsticks.app, name="yardsticks")
@@ -69,6 +87,7 @@ app.command("transfer", rich_help_panel=RESULTS)(evaluate.transfer)
 app.command("assignments", rich_help_panel=RESULTS)(evaluate.assignments)
 app.command("render", rich_help_panel=RESULTS)(render.render)
 app.command("export", rich_help_panel=RESULTS)(study.export)
+app.command("verify", rich_help_panel=RESULTS)(verify.verify)
 app.command("report", rich_help_panel=RESULTS)(science.report)
 app.command("ui", rich_help_panel=RESULTS)(ui.ui)
 app.command("theorem", rich_help_panel=RESULTS)(science.theorem)

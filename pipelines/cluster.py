@@ -22,7 +22,7 @@ from filelock import FileLock, Timeout
 from ray.exceptions import GetTimeoutError, RayError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from pipelines.fingerprint import fingerprint, package_folder
+from pipelines.identity import PACKAGE, fingerprint, folder_of
 from pipelines.litter import dead, owner, remove
 from pipelines.store import StoreError, one_line
 
@@ -157,7 +157,7 @@ def _refused(where: str, why: str) -> StoreError:
 
 def travelling(settings: dict[str, str]) -> dict[str, Any]:
     """What a launch brings along to every node: the code that the driver runs, and Ray's settings for workers."""
-    folders = [package_folder(), Path(__file__).parent]
+    folders = [folder_of(PACKAGE), Path(__file__).parent]
     return {"py_modules": [str(folder) for folder in folders], "env_vars": settings | {CODE: own_code()}}
 
 

@@ -1,7 +1,6 @@
 """What may be wrong with an installation and its work folder: each check gives one line, with what to do."""
 
 import os
-import re
 import shutil
 import sys
 from collections import Counter
@@ -10,10 +9,12 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Literal, NamedTuple
 
+from packaging.requirements import Requirement
+
 from pipelines.addresses import without_password
 from pipelines.store import Home, StoreError, one_line
 
-PYTHON = (3, 11)
+PYTHONS = ((3, 11), (3, 12), (3, 13))  # the first is that of the published results
 NEEDED = 2 * 2**30  # bytes free: a study of many runs with their checkpoints
 LOCK = Path(__file__).parents[1] / "requirements.lock"
 LOOPBACK = "127.0.0.1"
@@ -37,7 +38,7 @@ def examine(home: Path, *, ray: bool = True) -> Iterator[Finding]:
         home: the work folder; it need not be there.
         ray: also start Ray, which takes seconds.
     """
-    checks: list[Callable[[], Iterable[Finding]]] = [python, libraries, torch_build, code]
+    checks: list[Callable[[], Iterable[Finding]]] = [python, libraries, torch_build, arithmetic, code]
     checks += [lambda: disk(home), lambda: store(Home(home)), *([lambda: starts_ray(home)] if ray else [])]
     for check in checks:
         yield from check()
@@ -45,34 +46,38 @@ def examine(home: Path, *, ray: bool = True) -> Iterator[Finding]:
 
 def python(found: tuple[int, int] = (sys.version_info[0], sys.version_info[1])) -> list[Finding]:
     """The interpreter's version."""
-    name = ".".join(map(str, found))
-    if found == PYTHON:
+    name, *names = (".".join(map(str, one)) for one in (found, *PYTHONS))
+    if found in PYTHONS:
         return [Finding("ok", "python", f"{name} ({sys.executable})")]
-    return [Finding("fault", "python", f"{name}, and 3.11 is needed: make setup PYTHON=/path/to/python3.11")]
+    text = f"{name}, and one of {', '.join(names)} is needed: make setup PYTHON=/path/to/python{names[0]}"
+    return [Finding("fault", "python", text)]
 
 
-def libraries(pins: Mapping[str, str] | None = None) -> list[Finding]:
-    """Installed versions against the pins."""
-    wanted = locked() if pins is None else pins
+def libraries(wanted: Iterable[Requirement] | None = None) -> list[Finding]:
+    """Installed versions against those that are asked for."""
+    asked = list(required() if wanted is None else wanted)
     other = []
-    for name, pinned in wanted.items():
+    for one in asked:
         try:
-            found = version(name).partition("+")[0]
+            found = version(one.name).partition("+")[0]
         except PackageNotFoundError:
             found = "missing"
-        if found != pinned:
-            other.append(f"{name} {found} instead of {pinned}")
+        if found == "missing" or not one.specifier.contains(found, prereleases=True):
+            other.append(f"{one.name} {found} instead of {str(one.specifier).removeprefix('==')}")
     if not other:
-        return [Finding("ok", "libraries", f"all {len(wanted)} as pinned")]
+        return [Finding("ok", "libraries", f"all {len(asked)} as required")]
     more = f" and {len(other) - SHOWN} more" if len(other) > SHOWN else ""
     return [Finding("fault", "libraries", f"{', '.join(other[:SHOWN])}{more}: make setup")]
 
 
-def locked() -> dict[str, str]:
-    """The pins by name: of the lock in a checkout, else those that the installed package asks for."""
+def required() -> Iterator[Requirement]:
+    """The exact versions of the lock in a checkout, else the ranges of the installed package."""
     lines = LOCK.read_text(encoding="utf-8").splitlines() if LOCK.exists() else requires("rhmc") or []
-    found = (re.match(r"([\w.-]+)(?:\[\w+\])?==([\w.]+)\s*$", line) for line in lines)
-    return {match[1]: match[2] for match in found if match}
+    for line in lines:
+        if not line.startswith("#"):
+            one = Requirement(line)
+            if one.marker is None or one.marker.evaluate({"extra": ""}):
+                yield one
 
 
 def torch_build() -> list[Finding]:
@@ -90,6 +95,20 @@ def torch_build() -> list[Finding]:
         text = f"{torch.__version__}, built for CUDA {cuda}, and no device is here; the CPU build gives pinned results"
         return [Finding("note", "torch", text)]
     return [Finding("ok", "torch", f"{torch.__version__}, {f'CUDA {cuda}' if cuda else 'CPU build'}")]
+
+
+def arithmetic() -> list[Finding]:
+    """Whether torch's operations give the published bytes here."""
+    try:
+        from pipelines.arithmetic import differing
+
+        found = differing()
+    except (ImportError, OSError, RuntimeError) as error:
+        return [Finding("fault", "arithmetic", f"cannot be tried ({one_line(error)}): make setup")]
+    if not found:
+        return [Finding("ok", "arithmetic", "the published bytes")]
+    text = f"{', '.join(found)}: other bytes than the published ones, so results differ in their last bits at first"
+    return [Finding("note", "arithmetic", f"{text} (docs/reproducibility.md)")]
 
 
 def code(where: Path | None = None) -> list[Finding]:
@@ -128,15 +147,15 @@ def store(home: Home) -> Iterator[Finding]:
     if runs is None:
         yield Finding("ok", "store", f"{without_password(uri)}: nothing logged yet")
         return
-    from pipelines.fingerprint import fingerprint
+    from pipelines.identity import present
 
-    here = fingerprint()
+    here = present()
     yield Finding("ok", "store", f"{without_password(uri)}: {len(runs)} runs")
     for status in ("running", "interrupted", "failed"):
-        where = Counter(run.experiment for run in runs if run.status == status and run.fingerprint == here)
+        where = Counter(run.experiment for run in runs if run.status == status and run.fingerprint in here)
         if where:
             yield Finding("note", "runs", f"{sum(where.values())} {status}: {_places(where)}: {ADVICE[status]}")
-    stale = Counter(run.experiment for run in runs if run.fingerprint != here)
+    stale = Counter(run.experiment for run in runs if run.fingerprint not in here)
     if stale:
         text = f"{sum(stale.values())} made by other code: {_places(stale)}: `rhmc study run` would train them again"
         yield Finding("note", "stale", text)

@@ -9,7 +9,6 @@ import torch
 
 from pipelines.document import Node, Place, validate
 from pipelines.errors import InputError
-from pipelines.fingerprint import fingerprint
 from pipelines.litter import scratch
 from pipelines.plan import Item, chosen, study_card
 from pipelines.policy import CONFIG, FILE, Actor, NoPolicyError, Saved, load, settings
@@ -80,7 +79,7 @@ def task(env: EnvConfig, bank: Bank) -> EnvConfig:
     fields = {name: _option(value, name) for name, value in (env.model_dump(mode="json") | wanted).items()}
     if "targets" in wanted and "targets" not in type(env).model_fields:
         raise InputError("--targets: in navigation there are as many landmarks as agents; give --agents")
-    found, faults = validate(ENVS[env.kind][0], _option(fields, env.kind))
+    found, faults = validate(ENVS[env.kind].config, _option(fields, env.kind))
     if found is None:
         raise InputError(*map(str, faults))
     return found
@@ -113,7 +112,7 @@ def of_study(study: Study, home: Path, arms: Sequence[str] = (), seeds: Sequence
     Raises:
         InputError: there is no such arm, no policy at all, or a finished run has lost its own.
     """
-    plan = chosen(study, fingerprint(), arms, seeds)
+    plan = chosen(study, arms, seeds)
     from pipelines.mlflow_tracker import open_existing
 
     place = Home(home)

@@ -12,7 +12,6 @@ import pyarrow.parquet as pq
 
 from pipelines.errors import InputError, visible
 from pipelines.files import regular
-from pipelines.fingerprint import fingerprint
 from pipelines.host import Host
 from pipelines.origin import another
 from pipelines.plan import Item, items, study_card
@@ -48,7 +47,9 @@ RUNS = pa.schema(
         ("seconds", pa.float64()),  # spent training
     ]
 )
-EXPORTED = pa.schema([*RUNS, ("machine", pa.string()), ("versions", pa.string())])  # of a study: what started its runs
+EXPORTED = pa.schema(  # of a study: what started its runs, and from which code those were adopted that older code made
+    [*RUNS, ("machine", pa.string()), ("versions", pa.string()), ("adopted", pa.string())]
+)
 
 
 def export_study(study: Study, out: Path, home: Path | None = None) -> int:
@@ -72,7 +73,7 @@ def export_study(study: Study, out: Path, home: Path | None = None) -> int:
         print(visible(remark), file=sys.stderr)
     try:
         tracker = open_existing(study_card(study), place)
-        plan = items(study, fingerprint(), "")
+        plan = items(study)
         unfinished = write_tables(study, plan, tracker, out)
     except StoreError as error:
         print(f"rhmc: {error}", file=sys.stderr)
@@ -106,7 +107,7 @@ def _about(study: Study, item: Item, run: Recorded | None, rows: list[Row]) -> t
     seconds = max((row.value for row in rows if row.metric == "time/seconds"), default=0.0)
     card, commit = item.card, run.commit if run else ""
     names = (status, card.algorithm, card.task, study.profile, item.spec.canonical(), card.fingerprint, commit)
-    return (*names, study.question, seconds, *(run.host if run else Host()))
+    return (*names, study.question, seconds, *(run.host if run else Host()), run.adopted if run else "")
 
 
 def write_parquet(path: Path, schema: pa.Schema, rows: list[tuple[object, ...]]) -> None:

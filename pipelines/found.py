@@ -26,12 +26,12 @@ def stem(arm: str) -> str:
     return slug(arm).lower()
 
 
-def winner_yaml(search: Search, arm: str, best: Best, counts: dict[str, int], fingerprint: str) -> str:
+def winner_yaml(search: Search, arm: str, best: Best, counts: dict[str, int]) -> str:
     """The whole `algo` of the best trial, every default written out, and where it comes from."""
     algo = search.arms[arm].at(best.params).algo
     document = {
         "algo": {"kind": algo.kind} | algo.model_dump(mode="json"),
-        "provenance": _provenance(search, arm, best, counts, fingerprint),
+        "provenance": _provenance(search, arm, best, counts),
     }
     out = StringIO()
     yaml = YAML()
@@ -41,7 +41,7 @@ def winner_yaml(search: Search, arm: str, best: Best, counts: dict[str, int], fi
     return head + out.getvalue()
 
 
-def _provenance(search: Search, arm: str, best: Best, counts: dict[str, int], fingerprint: str) -> dict[str, Any]:
+def _provenance(search: Search, arm: str, best: Best, counts: dict[str, int]) -> dict[str, Any]:
     env = search.arms[arm].setting.env
     return {
         "search": Path(search.file).name,
@@ -50,7 +50,7 @@ def _provenance(search: Search, arm: str, best: Best, counts: dict[str, int], fi
         "profile": search.profile,
         "arm": arm,
         "question": search.question,
-        "fingerprint": fingerprint,
+        "fingerprint": search.code(arm),
         "trials": {"budget": search.trials} | {name: counts[name] for name in ("complete", "pruned", "failed")},
         "steps": search.steps,
         "sampler": search.sampler.model_dump(mode="json"),

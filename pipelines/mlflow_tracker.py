@@ -30,7 +30,7 @@ from pipelines.host import Host
 from pipelines.litter import part_of, remove, scratch
 from pipelines.sqlite import address, connect, connecting, reading_address, settle, sqlite_file
 from pipelines.store import Home, StoreError, one_line, replace_durably, sync
-from pipelines.tracker import VALUES_ONLY, Card, Recorded, Row, Status, StudyCard, unseen
+from pipelines.tracker import ADOPTED, VALUES_ONLY, Card, Recorded, Row, Status, StudyCard, unseen
 from rhmc.types import Metrics
 
 os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
@@ -61,6 +61,7 @@ PARENT = "study"  # tag `role` of the parent run; its runs have `run`
 DATABASES = ("postgresql", "mysql", "mssql")  # with a server, that MLflow can write to itself
 NOTE = "mlflow.note.content"  # the tag that MLflow shows as a description
 LONGEST = 8000  # characters of a run's tag
+MODULES = "modules"  # tag of a run: the digests of its code as JSON
 TRACE = "error.txt"  # a run's file with why it failed
 ARMS = "arms"  # the experiment's tag with its arms as JSON, in the order in which they came: it decides their colours
 COLOURED = 100  # arms that the tag has room for; a view shows no more
@@ -211,12 +212,12 @@ class MlflowTracker:
         """See `Tracker`."""
         return [run for _, run in self._listed([self.experiment] if self.experiment else [])]
 
-    def finished_anywhere(self, fingerprint: str) -> dict[str, str]:
+    def finished_anywhere(self, keys: Collection[str]) -> dict[str, str]:
         """See `Tracker`."""
         with explained(self.uri):
             everywhere = [e.experiment_id for e in self.client.search_experiments(max_results=1000)]
         runs = [run for _, run in reversed(self._listed(everywhere)) if run.status == "finished"]
-        return {run.key: run.ref for run in runs if run.key.rpartition("-")[2] == fingerprint}
+        return {run.key: run.ref for run in runs if run.key in keys}
 
     def _listed(self, experiments: Sequence[str]) -> list[tuple[str, Recorded]]:
         """Experiment and run of all runs there, oldest first."""
@@ -291,6 +292,7 @@ class MlflowTracker:
                 "fingerprint": card.fingerprint,
                 "commit": card.commit,
             }
+            | ({MODULES: json.dumps(dict(card.modules))} if card.modules else {})
             | {name: value for name, value in card.host._asdict().items() if value}
             | ({"imported": card.imported} if card.imported else {})
         )
@@ -607,9 +609,10 @@ def _recorded(ref: str, status: str, tags: Mapping[str, str]) -> Recorded:
     known: dict[str, str] = defaultdict(str, tags)
     key = f"{known['spec']}-{known['fingerprint']}"
     stale, host = views.STALE in tags, Host(known["machine"], known["versions"])
-    without = VALUES_ONLY in tags
+    modules: Mapping[str, str] = json.loads(known[MODULES] or "{}")
     return Recorded(
-        *(ref, known["variant"], key, FROM_MLFLOW[status], known["commit"], stale, host, known["error"], without)
+        *(ref, known["variant"], key, FROM_MLFLOW[status], known["commit"], stale, host, known["error"]),
+        *(VALUES_ONLY in tags, modules, known[ADOPTED]),
     )
 
 

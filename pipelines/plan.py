@@ -14,6 +14,7 @@ from ruamel.yaml.comments import CommentedSeq
 from pipelines.document import choices
 from pipelines.errors import InputError
 from pipelines.host import Host
+from pipelines.identity import combined, modules
 from pipelines.names import folded
 from pipelines.study import RunSpec, Study, changes
 from pipelines.tracker import Card, Recorded, StudyCard
@@ -43,8 +44,8 @@ class Item(NamedTuple):
         return self.card.key
 
 
-def items(study: Study, fingerprint: str, commit: str, where: Host | None = None) -> list[Item]:
-    """The runs of a study, in its order. where: what starts them, for those that are about to be."""
+def items(study: Study, commit: str = "", where: Host | None = None) -> list[Item]:
+    """The runs of a study under the code here, in its order. commit, where: of what is about to start them."""
     runs = study.runs()
     varying = what_varies([run.spec for run in runs])
     planned = []
@@ -53,12 +54,14 @@ def items(study: Study, fingerprint: str, commit: str, where: Host | None = None
         algorithm, task = spec.algo.kind, spec.env.kind
         params = {"method": algorithm} | {name: str(flat[name]) for name in varying if name in flat and name != KIND}
         params |= {"seed": str(spec.seed)}
-        card = Card(run.arm, spec.seed, spec.id, fingerprint, algorithm, task, commit, params, host=where or Host())
+        code = modules(algorithm, task)
+        names = (run.arm, spec.seed, spec.id, combined(code.values()), algorithm, task, commit)
+        card = Card(*names, params, host=where or Host(), modules=code)
         planned.append(Item(card, spec, study.name))
     return planned
 
 
-def chosen(study: Study, fingerprint: str, arms: Sequence[str] = (), seeds: Sequence[int] = ()) -> list[Item]:
+def chosen(study: Study, arms: Sequence[str] = (), seeds: Sequence[int] = ()) -> list[Item]:
     """The planned runs of these arms and seeds, of all where none are named; for commands with `--arm` and `--seed`.
 
     Raises:
@@ -67,7 +70,7 @@ def chosen(study: Study, fingerprint: str, arms: Sequence[str] = (), seeds: Sequ
     faults = [f"--arm: '{arm}' is not allowed; {choices(arm, study.arms)}" for arm in arms if arm not in study.arms]
     if faults:
         raise InputError(*faults)
-    plan = items(study, fingerprint, "")
+    plan = items(study)
     return [i for i in plan if (not arms or i.card.arm in arms) and (not seeds or i.card.seed in seeds)]
 
 

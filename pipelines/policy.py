@@ -79,7 +79,7 @@ class Actor:
 
 def sizes(env: EnvConfig) -> Spec:
     """Sizes of a task."""
-    return ENVS[env.kind][1].spec(env)
+    return ENVS[env.kind].physics.spec(env)
 
 
 # Files

@@ -1,7 +1,7 @@
 """From results of training to the log and the board; knows neither Ray nor MLflow."""
 
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +77,7 @@ class Recorder:
         """Copy what was finished already, for another arm or in another study, instead of training it again."""
         if not self.waiting:
             return
-        there = self.tracker.finished_anywhere(self.plan[0].card.fingerprint)
+        there = self.tracker.finished_anywhere(self.waiting)
         for key in [key for key in self.waiting if key in there]:
             self.adopt(key, there[key])
             Checkpoints(self.home.checkpoints(key)).clear_unused()
@@ -91,21 +91,7 @@ class Recorder:
     def _copy(self, source: str, items: list[Item]) -> None:
         points = points_of(self.tracker.rows([source])) if items else []
         for item in items:
-            log = self.tracker.start(item.card)
-            log.log(points)
-            log.text(CONFIG, resolved_yaml(item, self.study))
-            with scratch() as folder:
-                with decoration(f"{item.name}: its animation", self.board.say):
-                    for name in EXTRAS:
-                        self.tracker.file(source, name, folder)
-                config = resolved_yaml(item, self.study)  # for a policy without its spec
-                (folder / CONFIG).write_text(config, encoding="utf-8")
-                if self.tracker.file(source, FILE, folder):
-                    keep(log, folder, item.name, self.board.say)
-                else:
-                    log.tag(VALUES_ONLY, "yes")
-            log.tag("reused_from", source)
-            log.finish("finished")
+            copy_run(self.tracker, self.study, source, item, points, {"reused_from": source}, self.board.say)
             self.overview.points(item.card.arm, item.key, points)
             self.overview.ended(item.card.arm, item.key, "finished")
             self.board.say(f"{item.name}: the same training was finished before; copied")
@@ -190,6 +176,34 @@ class Recorder:
     def _end(self, key: str, status: Status) -> None:
         self.logs.pop(key).finish(status)
         self.overview.ended(self.arms[key], key, status)
+
+
+def copy_run(
+    tracker: Tracker,
+    study: StudyCard,
+    source: str,
+    item: Item,
+    points: list[Metrics],
+    tags: Mapping[str, str],
+    say: Callable[[str], None],
+) -> None:
+    """Log a planned run as finished, with the values and files of another one. say: see `keep`."""
+    log = tracker.start(item.card)
+    log.log(points)
+    log.text(CONFIG, resolved_yaml(item, study))
+    with scratch() as folder:
+        with decoration(f"{item.name}: its animation", say):
+            for name in EXTRAS:
+                tracker.file(source, name, folder)
+        config = resolved_yaml(item, study)  # for a policy without its spec
+        (folder / CONFIG).write_text(config, encoding="utf-8")
+        if tracker.file(source, FILE, folder):
+            keep(log, folder, item.name, say)
+        else:
+            log.tag(VALUES_ONLY, "yes")
+    for name, value in tags.items():
+        log.tag(name, value)
+    log.finish("finished")
 
 
 def keep(log: RunLog, folder: Path, name: str = "run", say: Callable[[str], None] = lambda _: None) -> None:

@@ -28,7 +28,7 @@ Act = Callable[[Any], tuple[Tensor, Tensor | None]]  # state -> action (1, N[, A
 
 def trained(actor: policy.Actor) -> Act:
     """How a trained policy acts in a state."""
-    observe = ENVS[actor.env.kind][1].observe
+    observe = ENVS[actor.env.kind].physics.observe
 
     def act(state: Any) -> tuple[Tensor, Tensor | None]:
         action, extra = actor.act(observe(actor.env, state))
@@ -77,7 +77,7 @@ def play(env: EnvConfig, act: Act, episode: int, place: Callable[[Any], Any] | N
 
     place: what is done to every state after the step into it.
     """
-    physics = ENVS[env.kind][1]
+    physics = ENVS[env.kind].physics
     world = Generator().manual_seed(episode)
     state = physics.initial(env, 1, world)
     scenes, rewards, infos = [Scene(state, None, "step 0")], [], []

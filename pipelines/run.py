@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, NamedTuple, Self
 
 from pipelines.addresses import without_password
 from pipelines.errors import InputError, visible
-from pipelines.fingerprint import fingerprint
 from pipelines.host import Host, host
 from pipelines.limits import absent
 from pipelines.origin import another, remember
@@ -24,6 +23,7 @@ from pipelines.progress import Board, board, print_table
 from pipelines.ray_settings import set_up_ray
 from pipelines.recorder import Recorder
 from pipelines.recorders import Recorders
+from pipelines.stale import reasons
 from pipelines.store import Home, StoreError
 from pipelines.study import Study
 from pipelines.terminal import terminal
@@ -156,9 +156,8 @@ class Interrupts:
 
 
 class Code(NamedTuple):
-    """What a launch runs, and where: the same for all of its studies."""
+    """What a launch says of its runs: the same for all of its studies."""
 
-    fingerprint: str
     commit: str
     host: Host
 
@@ -180,7 +179,7 @@ def _launch(studies: Sequence[Study], home: Home, interrupts: Interrupts) -> int
         known = read_commit()
         if known.why:
             display.say(f"the commit is logged as unknown: {known.why}")
-        code = Code(fingerprint(), known.name, host())
+        code = Code(known.name, host())
         launched = [logs.enter_context(_logged(study, code, home, display)) for study in studies]
         recorders = Recorders([one.recorder for one in launched])
         if skipped := sum(one.skipped for one in recorders.each):
@@ -321,35 +320,43 @@ STATES = ("finished", "running", "interrupted", "failed", "missing")
 
 
 def show_status(study: Study, home: Path, *, as_json: bool = False) -> int:
-    """Print how far a study is: per arm the runs finished, under way, failed (and why), missing, and stale.
+    """Print how far a study is: per arm the runs finished, under way, failed (and why), missing, and stale (and why).
 
     Returns:
         0 all finished, 1 not, 2 something is in the way.
     """
     try:
-        arms, complete, errors = _status(study, Home(home))
+        found = _status(study, Home(home))
     except StoreError as error:
         print(f"rhmc: {error}", file=sys.stderr)
         return BAD
     if as_json:
-        told = {"study": study.name, "profile": study.profile, "finished": complete, "arms": arms, "errors": errors}
-        print(json.dumps(told))
+        print(json.dumps({"study": study.name, "profile": study.profile} | found._asdict()))
     else:
         columns = ["planned", *STATES, "stale"]
-        rows = [[arm, *(str(one[c]) for c in columns)] for arm, one in arms.items()]
+        rows = [[arm, *(str(one[c]) for c in columns)] for arm, one in found.arms.items()]
         print_table(terminal(), ["arm", *columns], rows)
-        lines = [f"failed: {name}: {error}" for name, error in errors.items()]
+        lines = [f"failed: {name}: {error}" for name, error in found.errors.items()]
+        lines += [*found.stale, *(f"note: {remark}" for remark in study.remarks)]
         terminal().print("\n".join(map(visible, lines)), soft_wrap=True, end="\n" if lines else "")
-    return DONE if complete else FAILED
+    return DONE if found.finished else FAILED
 
 
-def _status(study: Study, home: Home) -> tuple[dict[str, dict[str, int]], bool, dict[str, str]]:
-    """Counts by arm and state, whether all is finished, and the error of each failed run by its name."""
+class Standing(NamedTuple):
+    """How far a study is."""
+
+    finished: bool  # all of it
+    arms: dict[str, dict[str, int]]  # runs by state
+    errors: dict[str, str]  # of each failed run, by its name
+    stale: list[str]  # why runs are no part of the plan, a line for each arm and reason
+
+
+def _status(study: Study, home: Home) -> Standing:
     from pipelines.mlflow_tracker import open_existing
 
     tracker = open_existing(study_card(study), home)
     recorded = tracker.recorded() if tracker else []
-    plan = items(study, fingerprint(), "")
+    plan = items(study)
     # Runs of a driver that was killed are logged as running; a log in this folder knows no other driver than one here.
     own = tracker is not None and tracker.own
     seen = {"running": "interrupted"} if own and not home.driven(study.name, study.profile) else {}
@@ -362,4 +369,5 @@ def _status(study: Study, home: Home) -> tuple[dict[str, dict[str, int]], bool, 
         arms[arm] = {"planned": len(places)} | {kind: mine[kind] for kind in STATES} | {"stale": stale[arm]}
     failed = {(run.arm, run.key): run.error for run in recorded if run.status == "failed"}
     errors = {item.name: failed[item.card.arm, item.key] for item in plan if (item.card.arm, item.key) in failed}
-    return arms, planned <= finished(recorded), errors
+    why = reasons(plan, recorded, tracker) if tracker else []
+    return Standing(planned <= finished(recorded), arms, errors, why)

@@ -25,6 +25,7 @@ from typing import Any, Literal, NamedTuple, Self, get_args
 from pydantic import Field, model_validator
 
 from pipelines.document import Fault, Node, Place, choices, show, validate
+from pipelines.identity import code_id
 from pipelines.names import study_name
 from pipelines.study import (
     TABLES,
@@ -199,14 +200,19 @@ class Search(Frozen):
         """The seeds of every trial."""
         return list(range(FIRST_SEED, FIRST_SEED + self.seeds))
 
-    def identity(self, arm: str, fingerprint: str) -> str:
+    def code(self, arm: str) -> str:
+        """The code that decides the trials of an arm."""
+        setting = self.arms[arm].setting
+        return code_id(setting.algo.kind, setting.env.kind)
+
+    def identity(self, arm: str) -> str:
         """12 hex digits over all that decides what the trials of an arm are and give, but for how many there are.
 
         More trials continue a search, anything else begins another.
         """
         one = self.arms[arm]
-        parts = [one.setting.canonical(), *(f"{k}={v.model_dump_json()}" for k, v in sorted(one.space.items()))]
-        parts += [self.sampler.model_dump_json(), self.pruner.model_dump_json(), str(self.seeds), fingerprint]
+        parts = [one.setting.stated(), *(f"{k}={v.model_dump_json()}" for k, v in sorted(one.space.items()))]
+        parts += [self.sampler.model_dump_json(), self.pruner.model_dump_json(), str(self.seeds), self.code(arm)]
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:12]
 
 

@@ -20,7 +20,6 @@ from ruamel.yaml import YAML
 from pipelines.addresses import without_password
 from pipelines.decoration import decoration
 from pipelines.errors import InputError, visible
-from pipelines.fingerprint import fingerprint
 from pipelines.found import file_name, stem, winner_yaml, write_text
 from pipelines.origin import another, remember
 from pipelines.plan import read_commit
@@ -96,7 +95,7 @@ def plots_folder(search: Search, home: Home) -> Path:
 def _launch(search: Search, home: Home, storage: BaseStorage, out: Path, interrupts: Interrupts) -> int:
     from pipelines.mlflow_tracker import MlflowTracker  # 3 s: only when something is launched
 
-    code, url = fingerprint(), storage_url(home)
+    url = storage_url(home)
     tracker = MlflowTracker(search_card(search), home)
     status: Status = "interrupted"
     try:
@@ -106,17 +105,17 @@ def _launch(search: Search, home: Home, storage: BaseStorage, out: Path, interru
             remember(home, search.name, search.profile, search.file)
             for remark in tracker.remarks:
                 display.say(remark)
-            ledgers = [Ledger(search, arm, code, storage) for arm in search.arms]
+            ledgers = [Ledger(search, arm, storage) for arm in search.arms]
             for ledger in ledgers:
                 again = ledger.take_up()
-                _clear(search, ledger, code, home)
+                _clear(search, ledger, home)
                 display.say(f"{ledger.arm}: {ledger.closed} of {search.trials} trials are done, {again} are taken up")
             if any(ledger.left for ledger in ledgers):
-                _train(search, ledgers, Book(search, code, tracker, display), home, interrupts)
+                _train(search, ledgers, Book(search, tracker, display), home, interrupts)
             whole = not any(ledger.left or ledger.live for ledger in ledgers)
             for ledger in ledgers if not whole else []:
                 ledger.take_up()
-            written = results(search, ledgers, code, tracker, home, out if whole else None, display.say)
+            written = results(search, ledgers, tracker, home, out if whole else None, display.say)
         failed = any(ledger.counts()["failed"] for ledger in ledgers)
         status = "interrupted" if not whole else "failed" if failed else "finished"
     finally:
@@ -125,10 +124,10 @@ def _launch(search: Search, home: Home, storage: BaseStorage, out: Path, interru
     return {"finished": DONE, "failed": FAILED}.get(status, interrupts.code)
 
 
-def _clear(search: Search, ledger: Ledger, code: str, home: Home) -> None:
+def _clear(search: Search, ledger: Ledger, home: Home) -> None:
     """Remove what a launch left that was killed between closing a trial and removing its checkpoints."""
     for asked in ledger.over():
-        Checkpoints(home.checkpoints(trial_card(search, asked, code, "").key)).clear_unused()
+        Checkpoints(home.checkpoints(trial_card(search, asked, "").key)).clear_unused()
 
 
 def _train(search: Search, ledgers: Sequence[Ledger], book: "Book", home: Home, interrupts: Interrupts) -> None:
@@ -277,13 +276,12 @@ class Book:
 
     Args:
         search: whose.
-        code: fingerprint.
         tracker: the log.
         display: the board.
     """
 
-    def __init__(self, search: Search, code: str, tracker: Tracker, display: Board) -> None:
-        self.search, self.code, self.tracker, self.board = search, code, tracker, display
+    def __init__(self, search: Search, tracker: Tracker, display: Board) -> None:
+        self.search, self.tracker, self.board = search, tracker, display
         self.commit, why = read_commit()
         if why:
             display.say(f"the commit is logged as unknown: {why}")
@@ -291,7 +289,7 @@ class Book:
 
     def start(self, asked: Asked) -> str:
         """A trial begins or continues; returns its key, which names it in the log and in the checkpoints."""
-        card = trial_card(self.search, asked, self.code, self.commit)
+        card = trial_card(self.search, asked, self.commit)
         log = self.logs[card.key] = self.tracker.start(card)
         log.tag("trial", str(asked.place))
         log.text("config.yaml", self._yaml(asked, card))
@@ -300,7 +298,7 @@ class Book:
 
     def _yaml(self, asked: Asked, card: Card) -> str:
         head = {"search": self.search.name, "profile": self.search.profile, "arm": asked.arm, "trial": asked.place}
-        names = {"fingerprint": self.code, "commit": card.commit, "seeds": self.search.seed_list()}
+        names = {"fingerprint": card.fingerprint, "commit": card.commit, "seeds": self.search.seed_list()}
         out = StringIO()
         YAML().dump(head | names | asked.setting.model_dump(mode="json"), out)
         return out.getvalue()
@@ -345,13 +343,13 @@ class Book:
         return f"{self.search.name} / {asked.name}"
 
 
-def trial_card(search: Search, asked: Asked, code: str, commit: str) -> Card:
+def trial_card(search: Search, asked: Asked, commit: str) -> Card:
     """A trial as its log shows it. Two trials with the same values are two runs."""
-    parts = (asked.setting.canonical(), str(search.seed_list()), str(asked.place), search.identity(asked.arm, code))
+    parts = (asked.setting.stated(), str(search.seed_list()), str(asked.place), search.identity(asked.arm))
     spec_id = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:12]
     kinds = asked.setting.algo.kind, asked.setting.env.kind
     params = {"method": kinds[0]} | {f"algo.{name}": str(value) for name, value in asked.params.items()}
-    return Card(asked.arm, search.seed_list()[0], spec_id, code, *kinds, commit, params, asked.place)
+    return Card(asked.arm, search.seed_list()[0], spec_id, search.code(asked.arm), *kinds, commit, params, asked.place)
 
 
 def search_card(search: Search) -> StudyCard:
@@ -385,7 +383,6 @@ class Written(NamedTuple):
 def results(
     search: Search,
     ledgers: Sequence[Ledger],
-    code: str,
     tracker: Tracker,
     home: Home,
     out: Path | None,
@@ -405,7 +402,7 @@ def results(
         best = ledger.best()
         if out is not None and best is not None:
             file = out / file_name(search, ledger.arm)
-            write_text(file, winner_yaml(search, ledger.arm, best, ledger.counts(), code))
+            write_text(file, winner_yaml(search, ledger.arm, best, ledger.counts()))
             written.winners.append(file)
     files = (*written.plots, *written.winners)
     with decoration(f"{search.name}: overview in the log", say):
@@ -456,13 +453,13 @@ def show_search(search: Search, home: Path) -> int:
     Returns:
         0 every trial is closed, 1 not, 2 something is in the way.
     """
-    place, code = Home(home), fingerprint()
+    place = Home(home)
     try:
         with opened(place, write=False) as storage, explained(storage_url(place)):
             if storage is None:
                 print(f"{search.name} ({search.profile}): nothing has been tried yet")
                 return FAILED
-            found = [look(search, arm, code, storage) for arm in search.arms]
+            found = [look(search, arm, storage) for arm in search.arms]
             print_table(terminal(), [*HEADER, "stale"], [[*_row(ledger), str(stale)] for ledger, stale in found])
             print("\n".join(_best_line(ledger) for ledger, _ in found))
             return DONE if all(ledger.closed >= search.trials for ledger, _ in found) else FAILED

@@ -15,7 +15,7 @@ from functools import reduce
 from pathlib import Path
 from typing import Annotated, Any, Generic, Literal, NamedTuple, Self, TypeVar
 
-from pydantic import BaseModel, Field, field_validator
+from pydantic import BaseModel, Field, SerializeAsAny, ValidationInfo, field_validator
 
 from pipelines import limits
 from pipelines.document import Fault, Node, Place, Unreadable, choices, join, merge, override, read, show, validate
@@ -31,7 +31,7 @@ from rhmc.types import Frozen
 SECTIONS = ("env", "algo", "trainer")
 COUNTS = ("seeds", "steps")  # fields of a study that hold a number for each profile
 TABLES: dict[str, dict[str, type[Any]]] = {  # the configuration of every kind
-    "env": {kind: entry[0] for kind, entry in ENVS.items()},
+    "env": {kind: task.config for kind, task in ENVS.items()},
     "algo": {kind: method.config for kind, method in ALGORITHMS.items()},
 }
 NAMED = 3  # arms that a fault names
@@ -57,19 +57,34 @@ class StudyError(InputError):
 class Setting(Frozen):
     """A run but for its seed."""
 
-    env: EnvConfig = Field(discriminator="kind")
+    env: SerializeAsAny[EnvConfig]
     algo: Any
     trainer: trainer.Config
 
-    @field_validator("algo", mode="before")
+    @field_validator("env", "algo", mode="before")
     @classmethod
-    def _algo_of_kind(cls, value: Any) -> Any:
+    def _of_kind(cls, value: Any, field: ValidationInfo) -> Any:
         """A plain mapping becomes the configuration that its kind names."""
-        return ALGORITHMS[value["kind"]].config.model_validate(value) if isinstance(value, dict) else value
+        if not isinstance(value, dict):
+            return value
+        table, kind = TABLES[str(field.field_name)], value.get("kind")
+        if not isinstance(kind, str) or kind not in table:
+            raise ValueError(f"kind: {show(kind)} is not allowed; {choices(kind, table)}")
+        return table[kind].model_validate(value)
 
     def canonical(self) -> str:
         """JSON with every default written out and keys sorted: equal exactly for equal settings."""
-        return json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
+        return _json(self.model_dump(mode="json"))
+
+    def stated(self) -> str:
+        """As `canonical`, with the kinds and what differs from the defaults alone.
+
+        A field that is new, with a default under which nothing changes, leaves it as it was; what a default does is in
+        the code.
+        """
+        sections = {name: getattr(self, name) for name in SECTIONS}
+        kinds = {"env": {"kind": self.env.kind}, "algo": {"kind": self.algo.kind}, "trainer": {}}
+        return _json({k: kinds[k] | v.model_dump(mode="json", exclude_defaults=True) for k, v in sections.items()})
 
 
 class RunSpec(Setting):
@@ -79,8 +94,12 @@ class RunSpec(Setting):
 
     @property
     def id(self) -> str:
-        """12 hex digits that name the run."""
-        return hashlib.sha256(self.canonical().encode()).hexdigest()[:12]
+        """12 hex digits that name the settings and the seed."""
+        return hashlib.sha256(f"{self.stated()} {self.seed}".encode()).hexdigest()[:12]
+
+
+def _json(tree: Any) -> str:
+    return json.dumps(tree, sort_keys=True, separators=(",", ":"))
 
 
 class PlannedRun(NamedTuple):

@@ -16,6 +16,7 @@ from rhmc.types import Metrics
 
 VALUES_ONLY = "values_only"  # tag of a run that came from a bundle without its policy
 Status = Literal["running", "finished", "failed", "interrupted"]
+ADOPTED = "adopted"  # tag of a run that other code made: which, and what was compared
 
 
 class StudyCard(NamedTuple):
@@ -41,6 +42,7 @@ class Card(NamedTuple):
     params: dict[str, str]  # what varies between the runs of the study, and method and seed
     trial: int | None = None  # of a search: then the run stands for all of its seeds
     host: Host = Host()  # that starts it
+    modules: Mapping[str, str] = MappingProxyType({})  # digests of the code that decides it
     imported: str = ""  # names what a bundle has of it, should it come from one
 
     @property
@@ -66,6 +68,8 @@ class Recorded(NamedTuple):
     host: Host = Host()
     error: str = ""  # why it failed, one line
     values_only: bool = False  # taken in from a bundle without policies
+    modules: Mapping[str, str] = MappingProxyType({})  # of the code that made it, where that was kept
+    adopted: str = ""  # from which code, and what was compared, if another code made it
 
 
 class Row(NamedTuple):
@@ -115,8 +119,8 @@ class Tracker(Protocol):
         """The runs logged so far, oldest first."""
         ...
 
-    def finished_anywhere(self, fingerprint: str) -> dict[str, str]:
-        """Key -> ref of a finished run, of whatever study shares the log."""
+    def finished_anywhere(self, keys: Collection[str]) -> dict[str, str]:
+        """Key -> ref of a finished run with one of these keys, of whatever study shares the log."""
         ...
 
     def mark(self, ref: str, *, stale: bool) -> None:
@@ -231,15 +235,8 @@ class MemoryTracker:
         """See `Tracker`."""
         return [
             Recorded(
-                r.ref,
-                r.card.arm,
-                r.card.key,
-                r.status,
-                r.card.commit,
-                "stale" in r.tags,
-                r.card.host,
-                r.tags.get("error", ""),
-                VALUES_ONLY in r.tags,
+                *(r.ref, r.card.arm, r.card.key, r.status, r.card.commit, "stale" in r.tags, r.card.host),
+                *(r.tags.get("error", ""), VALUES_ONLY in r.tags, r.card.modules, r.tags.get(ADOPTED, "")),
             )
             for r in self._mine()
         ]
@@ -252,9 +249,9 @@ class MemoryTracker:
         else:
             run.tags.pop("stale", None)
 
-    def finished_anywhere(self, fingerprint: str) -> dict[str, str]:
+    def finished_anywhere(self, keys: Collection[str]) -> dict[str, str]:
         """See `Tracker`."""
-        done = [r for r in self.shelf if r.status == "finished" and r.card.fingerprint == fingerprint]
+        done = [r for r in self.shelf if r.status == "finished" and r.card.key in keys]
         return {r.card.key: r.ref for r in reversed(done)}
 
     def start(self, card: Card) -> MemoryRun:

@@ -12,6 +12,7 @@ from pipelines.evaluation import Bank, Policy, score
 from pipelines.export import write_parquet
 from pipelines.side_by_side import side_by_side
 from pipelines.store import without_replay
+from rhmc.envs import coverage
 
 FILE = "transfer.parquet"
 TRANSFER = pa.schema(
@@ -84,7 +85,7 @@ def _light(policy: Policy) -> Policy:
 def _play(policy: Policy, study: str, agents: Sequence[int], targets: Sequence[int], episodes: int) -> list[Row]:
     """The rows of one policy."""
     env = policy.saved.spec.env
-    if env.kind != "coverage":
+    if not isinstance(env, coverage.Config):
         raise InputError(f"{policy.arm}: transfer is of coverage, where agents and targets have numbers of their own")
     rows: list[Row] = []
     for size in sizes(policy, agents, targets):

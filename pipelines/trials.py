@@ -71,13 +71,12 @@ class Ledger:
     Args:
         search: whose.
         arm: its name.
-        fingerprint: of the code.
         storage: see `open_storage`.
     """
 
-    def __init__(self, search: Search, arm: str, fingerprint: str, storage: BaseStorage) -> None:
+    def __init__(self, search: Search, arm: str, storage: BaseStorage) -> None:
         self.search, self.arm = search, arm
-        self.name = study_name(search, arm, fingerprint)
+        self.name = study_name(search, arm)
         pruner = make_pruner(search.pruner)
         if self.name in optuna.get_all_study_names(storage):  # which may be closed to writers
             self.study = optuna.load_study(study_name=self.name, storage=storage, pruner=pruner)
@@ -228,17 +227,17 @@ def values_of(trial: FrozenTrial) -> dict[str, Any]:
     return trial.params | trial.system_attrs.get("fixed_params", {})
 
 
-def study_name(search: Search, arm: str, fingerprint: str) -> str:
+def study_name(search: Search, arm: str) -> str:
     """An arm's study in Optuna."""
-    return f"{search.name} ({search.profile}) / {arm} / {search.identity(arm, fingerprint)}"
+    return f"{search.name} ({search.profile}) / {arm} / {search.identity(arm)}"
 
 
-def look(search: Search, arm: str, fingerprint: str, storage: BaseStorage) -> tuple[Ledger, int]:
+def look(search: Search, arm: str, storage: BaseStorage) -> tuple[Ledger, int]:
     """An arm's ledger for reading, empty where there is none, and how many trials have other settings or other code."""
-    name, names = study_name(search, arm, fingerprint), optuna.get_all_study_names(storage)
+    name, names = study_name(search, arm), optuna.get_all_study_names(storage)
     others = [n for n in names if n != name and n.rpartition(" / ")[0] == name.rpartition(" / ")[0]]
     stale = sum(len(optuna.load_study(study_name=n, storage=storage).get_trials(deepcopy=False)) for n in others)
-    return Ledger(search, arm, fingerprint, storage if name in names else InMemoryStorage()), stale
+    return Ledger(search, arm, storage if name in names else InMemoryStorage()), stale
 
 
 # From the file's words to Optuna's

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import pyarrow as pa
 
 from pipelines.export import METRICS, RUNS, read_parquet, write_parquet
-from pipelines.fingerprint import fingerprint
+from pipelines.identity import fingerprint
 from pipelines.plan import commit
 from pipelines.side_by_side import side_by_side
 from rhmc.envs import EnvConfig

@@ -18,7 +18,7 @@ from reports import claims as rules
 from reports.canvas import save, write_csv
 from reports.claims import VERDICTS, Claim
 from reports.escape import code, markdown, prose, stem, words
-from reports.frame import Results, TableError, load
+from reports.frame import Results, TableError, load, mixed
 from reports.gallery import Picture, gallery, in_short, reason, study_gallery
 from reports.letters import LOST
 from reports.paper import Paper, PaperError, read
@@ -347,7 +347,7 @@ def _content(report: Report, pictures: Path) -> Mapping[str, Any]:
         "claims": [page.card(claim) for claim in report.claims],
         "sections": _sections(report, pictures),
         "definitions": definitions(results),
-        "mixed": results.runs["fingerprint"].dropna().astype(str).replace("", None).nunique() > 1,
+        "mixed": mixed(results.runs),
         "provenance": page.provenance(results),
         "made": page.grid("provenance", report.tables["provenance"]),
         "runs": page.grid("runs", runs),
@@ -458,11 +458,11 @@ def _summary(results: Results) -> str:
 def _origin(results: Results) -> str:
     """Code and commit that made the runs."""
     found = []
-    for column, word in (("fingerprint", "code fingerprint"), ("commit", "commit")):
+    for column, word in (("fingerprint", "code"), ("commit", "commit")):
         values = sorted(set(results.runs[column].dropna().astype(str)) - {""})
-        mixed = " (**the runs were not all made by the same code**)" if column == "fingerprint" and values[1:] else ""
-        found.append(f"{word} {joined(map(code, values)) or 'unknown'}{mixed}")
-    return f"Made by {found[0]}, {found[1]}."
+        found.append(f"{word} {joined(map(code, values)) or 'unknown'}")
+    warning = " (**the runs were not all made by the same code**)" if mixed(results.runs) else ""
+    return f"Made by {found[0]}{warning}, {found[1]}."
 
 
 def _count(claims: Table) -> str:

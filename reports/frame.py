@@ -418,3 +418,15 @@ def _config(text: str) -> dict[str, Any]:
     except (ValueError, RecursionError):
         return {}
     return found if isinstance(found, dict) else {}
+
+
+def adopted(runs: pd.DataFrame) -> bool:
+    """Whether older code made some of the runs, and trainings of the present code repeated it."""
+    return "adopted" in runs and bool(runs["adopted"].fillna("").astype(bool).any())
+
+
+def mixed(runs: pd.DataFrame) -> bool:
+    """Whether runs of one method in one task were made by different code."""
+    known = runs[runs["fingerprint"].fillna("") != ""]
+    place = ["algorithm", "task"]
+    return len(known[[*place, "fingerprint"]].drop_duplicates()) > len(known[place].drop_duplicates())

@@ -11,7 +11,7 @@ from markupsafe import Markup, escape
 
 from reports.claims import JUDGED, VERDICTS, Claim, described
 from reports.escape import stem
-from reports.frame import TOLD, Results
+from reports.frame import TOLD, Results, adopted
 from reports.gallery import Picture
 from reports.tables import NONE, Table
 
@@ -171,8 +171,10 @@ def provenance(results: Results) -> list[tuple[str, str]]:
     runs = results.runs
     known = sorted(set(runs["fingerprint"].dropna().astype(str)) - {""})
     seconds = float(runs["seconds"].fillna(0).sum())
-    found = [("Profile", results.profile), ("Code fingerprint", ", ".join(known) or "unknown")]
+    found = [("Profile", results.profile), ("Code", ", ".join(known) or "unknown")]
     for name in TOLD:
+        if name == "adopted" and not adopted(runs):
+            continue
         values = sorted(set(runs[name].dropna().astype(str)) - {""}) if name in runs else []
         found.append((name.capitalize(), "; ".join(values) or "not exported"))
     return [*found, ("Processor time of all runs", duration(seconds))]

@@ -22,7 +22,7 @@ RUNS = (
     *("study", "arm", "seed", "run", "status", "algorithm", "task", "profile"),
     *("config", "fingerprint", "commit", "question", "seconds"),
 )
-TOLD = ("machine", "versions")  # of a run, where they are exported
+TOLD = ("machine", "versions", "adopted")  # of a run, where they are exported
 MOVED = "transfer"  # the table of trained policies with other numbers of agents and targets
 PLAYED = ("study", "arm", "seed", "run", "task", "agents", "targets", "trained_agents", "trained_targets", "value")
 ASSIGNED = "assignments"  # `<study>.assignments.parquet`: what the runs of a study assigned while they trained

@@ -23,7 +23,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 from scipy.optimize import brentq
-from scipy.stats import mannwhitneyu, norm, t, trim_mean, ttest_ind
+from scipy.stats import mannwhitneyu, norm, t, trim_mean, ttest_1samp, ttest_ind
 
 SEED = 20_240
 RESAMPLES = 40_000  # the cut tails of few seeds are thin
@@ -125,6 +125,32 @@ def welch(x: Values, y: Values) -> float:
     if min(len(x), len(y)) < 2 or (np.ptp(x) == 0 and np.ptp(y) == 0):
         return float("nan")
     return float(ttest_ind(x, y, equal_var=False).pvalue)
+
+
+def equivalence(x: Values, y: Values, margin: float) -> float:
+    """p of two one-sided Welch tests that the means differ by less than `margin`: below 0.05 they are level.
+
+    NaN below two values in a sample; 0 or 1 where there is no spread at all.
+    """
+    x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
+    if min(len(x), len(y)) < 2:
+        return float("nan")
+    if np.ptp(x) == 0 and np.ptp(y) == 0:
+        return float(abs(x[0] - y[0]) >= margin)
+    below = ttest_ind(x, y - margin, equal_var=False, alternative="greater").pvalue
+    above = ttest_ind(x, y + margin, equal_var=False, alternative="less").pvalue
+    return float(max(below, above))
+
+
+def equivalence_of_pairs(gaps: Values, margin: float) -> float:
+    """As `equivalence`, of differences between values that belong together. gaps: (n,)."""
+    if len(gaps) < 2:
+        return float("nan")
+    if np.ptp(gaps) == 0:
+        return float(abs(gaps[0]) >= margin)
+    below = ttest_1samp(gaps, -margin, alternative="greater").pvalue
+    above = ttest_1samp(gaps, margin, alternative="less").pvalue
+    return float(max(below, above))
 
 
 def holm(p: Values) -> Values:

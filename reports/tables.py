@@ -8,7 +8,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from reports.escape import latex, line, markdown
-from reports.frame import FINAL, METHOD, TOLD, Results
+from reports.frame import FINAL, METHOD, TOLD, Results, adopted
 from reports.paper import Paper
 from reports.stats import LEVEL, Interval, change, improvement, interval, iqm
 
@@ -219,10 +219,13 @@ def provenance(results: Results) -> Table:
                 "Commit": "\n".join(line(_short(commit)) for commit in known["commit"]) or NONE,
                 "Machine": "\n".join(map(line, known["machine"])) or NONE,
                 "Versions": "\n".join(map(line, known["versions"])) or NONE,
+                **({"Adopted": "\n".join(map(line, known["adopted"])) or NONE} if adopted(results.runs) else {}),
                 "Processor time": f"{number(seconds / 60)} min" if seconds else NONE,
             }
         )
-    note = "Code: fingerprint of what decides results. A commit with + had changes that were not committed."
+    note = "Code: one name for each method in each task. A commit with + had changes that were not committed."
+    if adopted(results.runs):
+        note += " Adopted: made by older code, and repeated bit for bit by what is named there."
     return Table("What made the runs", pd.DataFrame(numbers), pd.DataFrame(shown), note)
 
 

@@ -1,0 +1,5 @@
+"""The science: tasks, networks, methods and their training. Knows neither studies nor logs nor reports."""
+
+from rhmc.portable import apply
+
+apply()

@@ -54,4 +54,4 @@ def _play(algorithm: Algorithm, cfg: EnvConfig, batch: int, rng: torch.Generator
         rewards.append(step.reward)
         infos.append(step.info)
     info = {key: torch.stack([i[key] for i in infos]) for key in infos[0]}
-    return ENVS[cfg.kind][1].summary(cfg, torch.stack(rewards), info)
+    return ENVS[cfg.kind].physics.summary(cfg, torch.stack(rewards), info)

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 import torch
 from torch import Generator, Tensor
 
-from rhmc.envs import ENVS, EnvConfig
+from rhmc.envs import ENVS, EnvConfig, coverage
 from rhmc.envs.base import Outcome
 from rhmc.scripted import BOUNDS, SCRIPTED
 
@@ -85,7 +85,7 @@ def _episodes(cfg: EnvConfig, name: str, episodes: int, seed: int) -> dict[str, 
 
 def _policy(cfg: EnvConfig, name: str, batch: int, world: Generator, own: Generator) -> Iterator[dict[str, Tensor]]:
     """What each step of one episode per row logs."""
-    physics, act = ENVS[cfg.kind][1], SCRIPTED[cfg.kind][name]
+    physics, act = ENVS[cfg.kind].physics, SCRIPTED[cfg.kind][name]
     state = physics.initial(cfg, batch, world)
     for _ in range(physics.spec(cfg).episode):
         action = act(cfg, state, own)
@@ -96,16 +96,16 @@ def _policy(cfg: EnvConfig, name: str, batch: int, world: Generator, own: Genera
 
 def _bound(cfg: EnvConfig, name: str, batch: int, world: Generator, own: Generator) -> Iterator[dict[str, Tensor]]:
     """The same for a bound: its value in each state on the way (which no action of the sensors' changes)."""
-    physics, score = ENVS[cfg.kind][1], BOUNDS[cfg.kind][name]
+    physics, score = ENVS[cfg.kind].physics, BOUNDS[cfg.kind][name]
     state = physics.initial(cfg, batch, world)
     hold = SCRIPTED[cfg.kind]["hold"](cfg, state, own)
     for _ in range(physics.spec(cfg).episode):
         state = physics.transition(cfg, state, hold, world)
-        coverage = score(cfg, state)
-        yield {"coverage": coverage, **_global_reward(cfg, coverage)}
+        seen = score(cfg, state)
+        yield {"coverage": seen, **_global_reward(cfg, seen)}
 
 
-def _global_reward(cfg: EnvConfig, coverage: Tensor) -> dict[str, Tensor]:
-    if cfg.kind != "coverage" or cfg.preset == "executor":
+def _global_reward(cfg: EnvConfig, seen: Tensor) -> dict[str, Tensor]:
+    if not isinstance(cfg, coverage.Config) or cfg.preset == "executor":
         return {}
-    return {"reward": torch.where(coverage > 0, coverage, -cfg.penalty)}
+    return {"reward": torch.where(seen > 0, seen, -cfg.penalty)}

@@ -7,7 +7,7 @@ import torch
 from torch import Generator, Tensor
 
 from rhmc.algorithms import ALGORITHMS
-from rhmc.envs import ENVS, coverage, make_env, navigation
+from rhmc.envs import ENVS, Task, coverage, make_env, navigation
 from rhmc.evaluate import CHUNK, Episodes, evaluate
 from rhmc.trainer import Config, Trainer
 from rhmc.types import Obs, Transition
@@ -19,7 +19,7 @@ SHORT = navigation.Config(episode=4, agents=2)
 
 @pytest.fixture(autouse=True)
 def _toy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(ENVS, "toy", (toy.Config, toy))
+    monkeypatch.setitem(ENVS, "toy", Task(toy.Config, toy))
 
 
 class Fixed:

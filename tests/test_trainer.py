@@ -12,7 +12,7 @@ from torch import Generator, Tensor, nn
 from rhmc.algorithms import ALGORITHMS
 from rhmc.algorithms import rhmc as rhmc_page
 from rhmc.algorithms.base import Method
-from rhmc.envs import ENVS
+from rhmc.envs import ENVS, Task
 from rhmc.learner import Learner, Learners
 from rhmc.trainer import Config, Means, Trainer, grid_step
 from rhmc.types import Frozen, Metrics, Obs, Spec, Transition
@@ -67,7 +67,7 @@ class Recorder:
 
 @pytest.fixture(autouse=True)
 def _tables(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(ENVS, "toy", (toy.Config, toy))
+    monkeypatch.setitem(ENVS, "toy", Task(toy.Config, toy))
     monkeypatch.setitem(ALGORITHMS, "recorder", Method(RecorderConfig, Recorder, rhmc_page.ABOUT))
 
 

@@ -50,7 +50,7 @@ def methods(out: Annotated[Path | None, typer.Option(help="Also write methods.js
 
 def fingerprint(file: Annotated[Path | None, typer.Argument(help="Write it there, if it differs.")] = None) -> None:
     """Name the code that decides results: the same after editing a comment, another after editing behaviour."""
-    from pipelines.fingerprint import fingerprint as of_code
+    from pipelines.identity import fingerprint as of_code
 
     text = of_code() + "\n"
     if file is None:

@@ -10,6 +10,7 @@ import typer
 from pipelines.commands.common import (
     BAD,
     DONE,
+    UNFINISHED,
     File,
     Files,
     Json,
@@ -151,7 +152,35 @@ def import_runs(
         f"{taken.begun} to be continued"
     )
     if taken.foreign:
-        say(f"made by other code ({taken.foreign}): with the code here these runs would be trained again")
+        say(f"{taken.foreign} of them were made by other code: `rhmc study run` would train them again")
+        say("`rhmc study adopt FILE` lets them count where trainings of today repeat them bit for bit")
+
+
+@app.command("adopt")
+def adopt_runs(
+    files: Files,
+    profile: Profile = "quick",
+    variant: Variant = None,
+    verify: Annotated[int, typer.Option(min=1, metavar="K", help="Runs of each arm that are trained again.")] = 1,
+    until: Annotated[
+        int | None, typer.Option(min=1, metavar="STEP", help="To this step; whole runs without it.")
+    ] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Trainings at a time.")] = 2,
+    overrides: Sets = None,
+) -> None:
+    """Let finished runs of other code count for the code here, where trainings of today repeat them bit for bit.
+
+    Exit code 1 if an arm is refused: the first value that differs is named, and its runs stay as they are.
+    """
+    from pipelines.adoption import adopt
+    from pipelines.store import work_folder
+
+    refused = False
+    for study in load_studies(files, profile, overrides, variant):
+        say(f"{study.name} ({study.profile})")
+        proofs = adopt(study, work_folder(), verify, until, jobs, say)
+        refused = refused or any(proof.difference for proof in proofs)
+    raise typer.Exit(UNFINISHED if refused else DONE)
 
 
 def export(

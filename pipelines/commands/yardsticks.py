@@ -96,7 +96,7 @@ def _env(kind: str, fields: Fields) -> Any:
     def node(value: Any, name: str) -> Node:
         return Node(value, Place(f"--{name}"), Place(f"--{name}"), "")
 
-    cfg, faults = validate(ENVS[kind][0], node({name: node(value, name) for name, value in fields.items()}, kind))
+    cfg, faults = validate(ENVS[kind].config, node({name: node(value, name) for name, value in fields.items()}, kind))
     if cfg is None:
         raise InputError(*map(str, faults))
     return cfg
@@ -163,7 +163,7 @@ def _show(found: list["Scored"]) -> None:
 
 def _named(scored: "Scored") -> str:
     """A task in words, with what sets it apart from the others."""
-    env = scored.bank.env
+    env: Any = scored.bank.env
     if env.kind == "coverage":
         return f"coverage {env.preset}, {env.agents} x {env.targets}"
     return f"navigation {env.reward}, {env.agents}"

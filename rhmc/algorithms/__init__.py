@@ -1,16 +1,9 @@
-"""The methods: kind -> configuration, builder and description. Everything that lists methods reads this table."""
+"""The methods, a page each, which registers itself: importing this package fills `ALGORITHMS`.
 
-from rhmc.algorithms import coma, hitmac, ippo, iql, maddpg, mappo, qmix, rhmc, vdn
-from rhmc.algorithms.base import Method
+There is nothing here but imports, so that a new page changes the code of no other method.
+"""
 
-ALGORITHMS: dict[str, Method] = {
-    "rhmc": Method(rhmc.Config, rhmc.RHMC, rhmc.ABOUT),
-    "qmix": Method(qmix.Config, qmix.build, qmix.ABOUT),
-    "vdn": Method(vdn.Config, vdn.build, vdn.ABOUT),
-    "iql": Method(iql.Config, iql.build, iql.ABOUT),
-    "maddpg": Method(maddpg.Config, maddpg.MADDPG, maddpg.ABOUT),
-    "coma": Method(coma.Config, coma.COMA, coma.ABOUT),
-    "mappo": Method(mappo.Config, mappo.build, mappo.ABOUT),
-    "ippo": Method(ippo.Config, ippo.build, ippo.ABOUT),
-    "hitmac": Method(hitmac.Config, hitmac.HiTMAC, hitmac.ABOUT),
-}
+# The order is that of tables.
+# isort: off
+from rhmc.algorithms.base import ALGORITHMS, Method, register_method
+from rhmc.algorithms import rhmc, qmix, vdn, iql, maddpg, coma, mappo, ippo, hitmac

@@ -6,6 +6,7 @@ from typing import Any, Literal, NamedTuple, Protocol
 from torch import Generator, Tensor
 
 from rhmc.learner import Learners
+from rhmc.registry import register
 from rhmc.types import Batch, Carry, Obs, State, Transition
 
 
@@ -28,6 +29,18 @@ class Method(NamedTuple):
     config: type[Any]
     build: Callable[..., "Algorithm"]
     about: About
+
+
+ALGORITHMS: dict[str, Method] = {}  # by kind; everything that lists methods reads this table
+
+
+def register_method(kind: str, method: Method) -> None:
+    """Make a method known under the kind that studies write; its page calls this once, at its end.
+
+    Raises:
+        ValueError: another method has the kind.
+    """
+    register(ALGORITHMS, kind, method)
 
 
 class Algorithm(Protocol):

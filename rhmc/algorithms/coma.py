@@ -19,7 +19,7 @@ from torch import Generator, Tensor
 from torch.nn.functional import mse_loss, one_hot
 
 from rhmc import checkpoint
-from rhmc.algorithms.base import About
+from rhmc.algorithms.base import About, Method, register_method
 from rhmc.experience import Rollout, ends, flat, minibatches
 from rhmc.learner import Learner, Learners, taken, unpack
 from rhmc.nets import ENCODERS, Sizes, team
@@ -184,3 +184,6 @@ def draw(chance: Tensor, rng: Generator) -> Tensor:
 def expected(q: Tensor, chance: Tensor) -> Tensor:
     """The mean (B, N) of action values under their chances, (B, N, actions) both: the baseline of eq. 4."""
     return (q * chance).sum(-1)
+
+
+register_method("coma", Method(Config, COMA, ABOUT))

@@ -18,7 +18,7 @@ from pydantic import Field
 from torch import Generator, Tensor
 
 from rhmc import attention, checkpoint, executor
-from rhmc.algorithms.base import About
+from rhmc.algorithms.base import About, Method, register_method
 from rhmc.experience import Experience
 from rhmc.learner import Learners, Replay, choose, pack
 from rhmc.settings import OffPolicy
@@ -179,3 +179,6 @@ def practice(first: Tensor, held: Tensor, rng: Generator) -> Tensor:
     drawn = (draw[..., 1:] < draw[..., :1]).float()
     new = first | (torch.rand(len(first), generator=rng, device=rng.device) < 1 / PRACTISED)
     return torch.where(new.view(-1, 1, 1), drawn, held)
+
+
+register_method("hitmac", Method(Config, HiTMAC, ABOUT))

@@ -9,7 +9,7 @@ from typing import Literal
 from torch import Generator
 
 from rhmc import ppo
-from rhmc.algorithms.base import About
+from rhmc.algorithms.base import About, Method, register_method
 from rhmc.types import Spec
 
 ABOUT = About(
@@ -32,3 +32,6 @@ class Config(ppo.Config):
 def build(cfg: Config, spec: Spec, num_envs: int, rng: Generator) -> ppo.PPO:
     """The learner."""
     return ppo.PPO(cfg, spec, rng, "local")
+
+
+register_method("ippo", Method(Config, build, ABOUT))

@@ -18,7 +18,7 @@ from torch import Generator, Tensor
 from torch.nn.functional import mse_loss
 
 from rhmc import checkpoint
-from rhmc.algorithms.base import About
+from rhmc.algorithms.base import About, Method, register_method
 from rhmc.experience import Experience
 from rhmc.heads import Continuous, Discrete, Head
 from rhmc.learner import Learner, Learners, pack_step, unpack
@@ -133,3 +133,6 @@ class MADDPG:
     def load_state_dict(self, state: State) -> None:
         """Continue from `state_dict`."""
         checkpoint.load(state, self.rng, self._parts())
+
+
+register_method("maddpg", Method(Config, MADDPG, ABOUT))

@@ -13,7 +13,7 @@ from pydantic import Field
 from torch import Generator
 
 from rhmc import qlearning
-from rhmc.algorithms.base import About
+from rhmc.algorithms.base import About, Method, register_method
 from rhmc.nets import ENCODERS, Sizes
 from rhmc.types import Spec
 
@@ -39,3 +39,6 @@ def build(cfg: Config, spec: Spec, num_envs: int, rng: Generator) -> qlearning.Q
     """The learner."""
     mixer = ENCODERS[cfg.encoder].mixer(Sizes.of(spec), cfg.hidden, cfg.embed)
     return qlearning.QLearning(cfg, spec, rng, mixer)
+
+
+register_method("qmix", Method(Config, build, ABOUT))

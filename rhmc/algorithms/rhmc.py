@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 from torch import Generator, Tensor
 
 from rhmc import checkpoint, coordinator, executor, mixed
-from rhmc.algorithms.base import About
+from rhmc.algorithms.base import About, Method, register_method
 from rhmc.experience import Experience
 from rhmc.learner import Learners, Replay, choose, pack
 from rhmc.regulation import REGULATORS, executed
@@ -155,3 +155,6 @@ EXECUTORS: dict[str, type[executor.Executor | mixed.MixedExecutor]] = {
     "mixed": mixed.MixedExecutor,
 }
 PAID = {"assigned": _assigned, "team": _team}
+
+
+register_method("rhmc", Method(Config, RHMC, ABOUT))

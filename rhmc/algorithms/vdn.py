@@ -10,7 +10,7 @@ from typing import Literal
 from torch import Generator, Tensor, nn
 
 from rhmc import qlearning
-from rhmc.algorithms.base import About
+from rhmc.algorithms.base import About, Method, register_method
 from rhmc.types import Obs, Spec
 
 ABOUT = About(
@@ -40,3 +40,6 @@ class Sum(nn.Module):
 def build(cfg: Config, spec: Spec, num_envs: int, rng: Generator) -> qlearning.QLearning:
     """The learner."""
     return qlearning.QLearning(cfg, spec, rng, Sum())
+
+
+register_method("vdn", Method(Config, build, ABOUT))

@@ -7,7 +7,8 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 import torch
 from torch import Generator, Tensor
 
-from rhmc.types import Local, Obs, Spec, State, Step
+from rhmc.registry import register
+from rhmc.types import Frozen, Local, Obs, Spec, State, Step
 
 S = TypeVar("S", bound=tuple[Tensor, ...])
 
@@ -41,6 +42,33 @@ class Physics(Protocol):
     def options(self) -> Callable[[Any, Any, int], Tensor]: ...
     @property
     def summary(self) -> Callable[[Any, Tensor, dict[str, Tensor]], dict[str, Tensor]]: ...
+
+
+class EnvConfig(Frozen):
+    """What the configuration of every task has; a task adds its own fields."""
+
+    kind: str
+    agents: int
+    observation: str
+
+
+class Task(NamedTuple):
+    """An entry of the table of tasks."""
+
+    config: type[Any]
+    physics: Physics
+
+
+ENVS: dict[str, Task] = {}  # by kind; everything that lists tasks reads this table
+
+
+def register_task(kind: str, task: Task) -> None:
+    """Make a task known under the kind that studies write; its page calls this once, at its end.
+
+    Raises:
+        ValueError: another task has the kind.
+    """
+    register(ENVS, kind, task)
 
 
 class Env:
@@ -100,3 +128,8 @@ def where(mask: Tensor, new: S, old: S) -> S:
     """Row-wise choice between two states (NamedTuples of tensors, leading B) by mask (B,)."""
     pairs = zip(new, old, strict=True)
     return type(old)(*(torch.where(mask.view(-1, *[1] * (o.dim() - 1)), n, o) for n, o in pairs))
+
+
+def make_env(cfg: EnvConfig, batch: int, rng: Generator) -> Env:
+    """B copies of the configured task on the generator's device."""
+    return Env(ENVS[cfg.kind].physics, cfg, batch, rng)

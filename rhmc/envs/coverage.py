@@ -3,14 +3,15 @@
 Lengths in metres of the published task, angles in degrees counter-clockwise from +x, time in steps.
 """
 
+import sys
 from typing import Literal, NamedTuple, Self
 
 import torch
 from pydantic import Field, model_validator
 from torch import Generator, Tensor
 
-from rhmc.envs.base import Outcome, where
-from rhmc.types import Frozen, Local, Obs, Spec, assigned_reward
+from rhmc.envs.base import EnvConfig, Outcome, Task, register_task, where
+from rhmc.types import Local, Obs, Spec, assigned_reward
 
 HALF_AREA = 1250.0  # targets stay in [-1250, 1250]^2
 RANGE = 800.0
@@ -49,7 +50,7 @@ PRESETS = {
 }
 
 
-class Config(Frozen):
+class Config(EnvConfig):
     """The task; `preset` chooses among the three published variants (`PRESETS`)."""
 
     kind: Literal["coverage"] = "coverage"
@@ -267,3 +268,6 @@ def _displacement(targets: Tensor, goal: Tensor, speed: Tensor, u: Tensor, dt: f
 
 def _norm(v: Tensor) -> Tensor:
     return torch.linalg.vector_norm(v, dim=-1)
+
+
+register_task("coverage", Task(Config, sys.modules[__name__]))

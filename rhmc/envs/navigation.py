@@ -4,6 +4,7 @@ Lengths in units of the half-side of the start square, time in steps of 0.1, mas
 no speed limit and no noise; landmarks neither move nor collide.
 """
 
+import sys
 from functools import cache
 from typing import Literal, NamedTuple
 
@@ -12,8 +13,8 @@ from pydantic import Field
 from torch import Generator, Tensor
 from torch.nn.functional import embedding, softplus
 
-from rhmc.envs.base import Outcome
-from rhmc.types import Frozen, Local, Obs, Spec
+from rhmc.envs.base import EnvConfig, Outcome, Task, register_task
+from rhmc.types import Local, Obs, Spec
 
 DT = 0.1
 KEPT = 0.75  # share of the velocity that a step keeps
@@ -27,7 +28,7 @@ FAR = 8**0.5  # diagonal of the start square: how far "the nearest other" is whe
 Order = Literal["mpe2", "mpe1"]
 
 
-class Config(Frozen):
+class Config(EnvConfig):
     """The task. `reward` and `order` both name a published version and are independent of each other."""
 
     kind: Literal["navigation"] = "navigation"
@@ -210,3 +211,6 @@ def _nearest_other(distance: Tensor) -> Tensor:
 @cache
 def _directions(dtype: torch.dtype, device: torch.device) -> Tensor:
     return torch.tensor(DIRECTIONS, dtype=dtype, device=device)
+
+
+register_task("navigation", Task(Config, sys.modules[__name__]))

@@ -12,7 +12,7 @@ from torch.nn import functional
 from torch.overrides import TorchFunctionMode
 
 from rhmc.algorithms import ALGORITHMS
-from rhmc.envs import ENVS, coverage, make_env, navigation
+from rhmc.envs import ENVS, Task, coverage, make_env, navigation
 from rhmc.envs.base import Env
 from rhmc.learner import Learner, Replay
 from rhmc.nets import Unshared
@@ -106,7 +106,7 @@ every = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 @pytest.fixture(autouse=True)
 def _short_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(coverage.PRESETS, "flat", coverage.PRESETS["flat"]._replace(episode=EPISODE))
-    monkeypatch.setitem(ENVS, "toy", (toy.Config, toy))
+    monkeypatch.setitem(ENVS, "toy", Task(toy.Config, toy))
 
 
 def trainer(case: Case, seed: int = 0) -> Trainer:

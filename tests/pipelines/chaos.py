@@ -41,7 +41,6 @@ from pipelines.store import Home
 from pipelines.study import Study
 from pipelines.tracker import StudyCard
 from pipelines.trainable import RunTrainable
-from tests.pipelines.support import CODE
 
 ray.tune.trainable.trainable.DEFAULT_STORAGE_PATH = tempfile.gettempdir() + "/ray_results"  # not in a tester's home
 PRELOAD = ["mlflow.server", "mlflow.store.tracking.sqlalchemy_store"]
@@ -214,7 +213,6 @@ def _drive(study: str, home: str, uri: str | None, length: int, room: int | None
     if uri:
         os.environ["MLFLOW_TRACKING_URI"] = uri
     os.environ["MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR"] = "0"  # at most a second between two tries
-    run.fingerprint = lambda: CODE
     ray_driver.ray_session = lambda *args: nullcontext([])
     ray_driver.fit = fit_here
     fuse = Fuse(length)

@@ -32,7 +32,7 @@ from pipelines.tracker import StudyCard
 from reports import build
 from tests.pipelines import chaos
 from tests.pipelines.chaos import KILLED, Fuse, Run, faults, fit_here, logged, settle, start
-from tests.pipelines.support import CODE, setting, tiny
+from tests.pipelines.support import setting, tiny
 
 chaos.PRELOAD.extend(["pipelines.bundle", "pipelines.registry", "pipelines.search_plots", "reports.build"])
 STUDY = tiny("killed", 6, {name: setting(lr=1e-2) for name in ("fast", "twin")})  # one is trained and the other copied
@@ -221,8 +221,6 @@ def _act(number: int, home: str, packed: str, length: int, count: str) -> None:
     os.chdir(Path(home).parent)
     tempfile.tempdir = f"{home}/tmp"
     Path(tempfile.tempdir).mkdir(exist_ok=True)
-    for module in (run, export, search_run, bundle):
-        module.fingerprint = lambda: CODE  # type: ignore[attr-defined]
     for module in (run, search_run):
         module.read_commit = lambda: Commit("c0ffee")  # type: ignore[attr-defined]  # the code may be worked on meanwhile
     ray_driver.ray_session = lambda *args: nullcontext([])  # type: ignore[assignment,return-value]
@@ -261,7 +259,6 @@ def make_world(folder: Path, template: Path | None = None) -> World:
     pipeline = VERBS[-1]
     assert act(pipeline, world.home, world) == 0, log(world.home)
     shutil.copytree(world.home / OUT, folder / "tables")
-    bundle.fingerprint = lambda: CODE  # type: ignore[assignment]
     bundle.pack(STUDY, world.bundle, world.home)
     return world
 

@@ -30,7 +30,7 @@ from pipelines.plan import items, study_card
 from pipelines.store import Home
 from pipelines.study import Study
 from tests.pipelines.chaos import WORKER, Run, damage, everything, faults, free_port
-from tests.pipelines.support import CODE, setting, started_by, tiny
+from tests.pipelines.support import setting, started_by, tiny
 
 KINDS = ("driver", "worker", "server", "driver, politely", "node")
 ROOT = Path(__file__).parents[2]
@@ -175,7 +175,7 @@ def result(home: Path, uri: str, points: int) -> tuple[list[Run], bytes]:
     os.environ["MLFLOW_TRACKING_URI"] = uri
     plan = study(points)
     tracker = open_existing(study_card(plan), Home(home))
-    write_tables(plan, items(plan, CODE, ""), tracker, home / "out")
+    write_tables(plan, items(plan), tracker, home / "out")
     return everything(plan, home), (home / "out" / "soak.parquet").read_bytes()
 
 
@@ -218,7 +218,6 @@ def main() -> int:
     parser.add_argument("--drive", type=Path, help=argparse.SUPPRESS)
     chosen = parser.parse_args()
     if chosen.drive:
-        run.fingerprint = lambda: CODE
         return run.run_studies([study(chosen.points)], chosen.drive)
     start = time.monotonic()
     with TemporaryDirectory(ignore_cleanup_errors=True) as temporary:

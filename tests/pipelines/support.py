@@ -10,11 +10,12 @@ from typing import Any
 import psutil
 import pytest
 
+from pipelines.identity import code_id
 from pipelines.plan import Item, items
 from pipelines.side_by_side import side_by_side
 from pipelines.study import Resources, RunSpec, Setting, Study
 
-CODE = "c0dec0dec0de"  # a fingerprint
+CODE = code_id("iql", "coverage")  # of all runs here
 
 
 def setting(**algo: Any) -> Setting:
@@ -53,8 +54,8 @@ def tiny(name: str = "tiny", points: int = 3, arms: dict[str, Setting] | None = 
 
 
 def plan(study: Study | None = None) -> list[Item]:
-    """Its runs under the fingerprint `CODE`."""
-    return items(study or tiny(), CODE, "abc-dirty")
+    """Its runs."""
+    return items(study or tiny(), "abc-dirty")
 
 
 def jobs_of(module: str, monkeypatch: pytest.MonkeyPatch) -> list[int]:
@@ -82,5 +83,4 @@ def started_by(driver: int, name: str = "") -> list[psutil.Process]:
 if __name__ == "__main__":
     from pipelines import run
 
-    run.fingerprint = lambda: CODE
     sys.exit(run.run_studies([tiny(points=int(sys.argv[2]))], Path(sys.argv[1])))

@@ -41,12 +41,6 @@ STUDY = tiny(arms={arm: setting(lr=rate) for arm, rate in RATES.items()})
 DONE = STUDY.model_copy(update={"arms": {arm: STUDY.arms[arm] for arm in ("slow", "fast")}})  # its runs are finished
 
 
-@pytest.fixture(autouse=True)
-def _code(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("bundle", "export", "evaluation", "run"):
-        monkeypatch.setattr(f"pipelines.{name}.fingerprint", lambda: CODE)
-
-
 def made(folder: Path, template: Path) -> Path:
     """A work folder with an empty MLflow database."""
     folder.mkdir(exist_ok=True)
@@ -58,7 +52,7 @@ def made(folder: Path, template: Path) -> Path:
 def here(tmp_path_factory: pytest.TempPathFactory, template: Path) -> Path:
     """Two finished runs, one that has two checkpoints, one that was never begun. Not to be changed."""
     home = made(tmp_path_factory.mktemp("here"), template)
-    slow, fast, late, _ = items(STUDY, CODE, "abc")
+    slow, fast, late, _ = items(STUDY, "abc")
     for study in (STUDY, DONE.model_copy(update={"name": "done"})):
         tracker = MlflowTracker(study_card(study), Home(home))
         for item in (slow, fast):
@@ -88,9 +82,7 @@ def train(home: Path, spec: RunSpec, key: str, points: int) -> None:
 def good(here: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bundle as a folder. Not to be changed."""
     out = tmp_path_factory.mktemp("good") / "b"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pipelines.bundle.fingerprint", lambda: CODE)
-        pack(STUDY, out, here)
+    pack(STUDY, out, here)
     return out
 
 
@@ -133,14 +125,14 @@ def test_there_is_what_was_here(here: Path, there: Path, tmp_path: Path, name: s
     assert pack(STUDY, out, here) == Packed(planned=4, finished=2, begun=1, astray=[])
     assert out.is_dir() == (name == "bundle")
     assert [path.name for path in tmp_path.iterdir()] == [name]
-    assert unpack(out, there) == Taken("tiny", "quick", new=2, known=0, begun=1, foreign="")
+    assert unpack(out, there) == Taken("tiny", "quick", new=2, known=0, begun=1, foreign=0)
 
     tables = []
     for home in (here, there):
         export_study(STUDY, tmp_path / home.name, home)
         tables.append(pq.read_table(tmp_path / home.name / "tiny.parquet").to_pylist())
     assert tables[0] == tables[1] != []
-    slow, _, late, _ = items(STUDY, CODE, "")
+    slow, _, late, _ = items(STUDY)
     tracker = log_of(there)
     runs = {run.arm: run for run in tracker.recorded()}
     assert {arm: (run.status, run.commit) for arm, run in runs.items()} == {
@@ -178,7 +170,7 @@ def test_who_asks_for_policies_that_did_not_travel_is_told_so(here: Path, there:
 
 def test_a_second_import_adds_nothing_and_keeps_what_got_further(good: Path, there: Path) -> None:
     unpack(good, there)
-    late = items(STUDY, CODE, "")[2]
+    late = items(STUDY)[2]
     Checkpoints(Home(there).checkpoints(late.key)).save(3, {"a": 2})
     taken = unpack(good, there)
     assert (taken.new, taken.known, taken.begun) == (0, 2, 0)
@@ -187,8 +179,8 @@ def test_a_second_import_adds_nothing_and_keeps_what_got_further(good: Path, the
 
 
 def test_runs_of_other_code_are_said_to_be(good: Path, there: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipelines.bundle.fingerprint", lambda: "0ther")
-    assert unpack(good, there).foreign == CODE
+    monkeypatch.setattr("pipelines.bundle.present", lambda: frozenset({"0ther"}))
+    assert unpack(good, there).foreign == 3
 
 
 def test_nothing_to_pack_and_a_name_that_is_taken(here: Path, there: Path, tmp_path: Path) -> None:
@@ -205,7 +197,7 @@ def test_nothing_to_pack_and_a_name_that_is_taken(here: Path, there: Path, tmp_p
 
 def test_a_run_that_went_astray_stays_behind_and_is_named(there: Path, tmp_path: Path) -> None:
     tracker = MlflowTracker(study_card(STUDY), Home(there))
-    for item, value in zip(items(STUDY, CODE, "")[:2], (1.0, float("nan")), strict=True):
+    for item, value in zip(items(STUDY)[:2], (1.0, float("nan")), strict=True):
         run = tracker.start(item.card)
         steps = [grid_step(item.spec.trainer, point) for point in range(4)]
         run.log([{"step": float(step), "train/loss": value} for step in steps] + [{"step": 600.0, "final/return": 1.0}])
@@ -215,7 +207,7 @@ def test_a_run_that_went_astray_stays_behind_and_is_named(there: Path, tmp_path:
 
 
 def test_a_log_that_import_would_refuse_is_not_packed(there: Path, tmp_path: Path) -> None:
-    run = MlflowTracker(study_card(STUDY), Home(there)).start(items(STUDY, CODE, "")[0].card)
+    run = MlflowTracker(study_card(STUDY), Home(there)).start(items(STUDY)[0].card)
     run.log([{"step": 600.0, "final/return": 1.0}])
     run.finish("finished")
     with pytest.raises(StoreError, match=r"b: cannot be packed .*: runs\.parquet: row 0: .* values at 1 of 4 points"):
@@ -230,7 +222,7 @@ def test_a_study_that_is_being_run_is_left_alone(good: Path, there: Path) -> Non
 
 
 def test_a_run_that_another_process_trains_is_left_alone_and_nothing_is_written(good: Path, there: Path) -> None:
-    late = items(STUDY, CODE, "")[2]
+    late = items(STUDY)[2]
     folder = Home(there).checkpoints(late.key)
     folder.mkdir(parents=True)
     with Checkpoints(folder).lock(), pytest.raises(StoreError, match=f"{late.key}: another process is training"):
@@ -282,8 +274,18 @@ def keep_run(folder: Path, at: int) -> None:
 def earlier(folder: Path) -> None:
     """As the version before wrote it."""
     about = json.loads((folder / "bundle.json").read_text())
-    del about["plan"]
-    (folder / "bundle.json").write_text(json.dumps(about | {"format": 2}))
+    for name in ("plan", "code", "adopted"):
+        del about[name]
+    (folder / "bundle.json").write_text(json.dumps(about | {"format": 2, "fingerprint": "01dc0de00000"}))
+    table = pq.read_table(folder / "runs.parquet")
+    keys = []
+    for old, config in zip(table["key"].to_pylist(), table["config"].to_pylist(), strict=True):
+        keys.append(f"{hashlib.sha256(config.encode()).hexdigest()[:12]}-01dc0de00000")
+        for path in (folder / "policies" / f"{old}.pt", folder / "checkpoints" / old):
+            if path.exists():
+                path.rename(path.with_name(path.name.replace(old, keys[-1])))
+    table = table.set_column(0, "key", pa.array(keys, pa.string()))
+    pq.write_table(table, folder / "runs.parquet")
 
 
 def test_a_bundle_of_the_format_before_is_read(here: Path, there: Path, tmp_path: Path, bundle: Path) -> None:
@@ -291,12 +293,14 @@ def test_a_bundle_of_the_format_before_is_read(here: Path, there: Path, tmp_path
     pack(whole, tmp_path / "whole", here)
     for folder in (tmp_path / "whole", bundle):
         earlier(folder)
-        assert unpack(folder, there).new == 2
+        taken = unpack(folder, there)
+        assert taken.new == 2
+        assert taken.foreign == 2 + taken.begun
     assert (parent(there, whole), parent(there)) == ("FINISHED", "KILLED")
 
 
 def test_what_was_begun_here_does_not_meet_what_comes_from_there(good: Path, there: Path) -> None:
-    slow, _, late, _ = items(STUDY, CODE, "own")
+    slow, _, late, _ = items(STUDY, "own")
     tracker = MlflowTracker(study_card(STUDY), Home(there))
     for item in (slow, late):
         tracker.start(item.card).log([{"step": 0.0, "eval/return": -777.0, "eval/of_this_machine": 1.0}])
@@ -310,7 +314,7 @@ def test_what_was_begun_here_does_not_meet_what_comes_from_there(good: Path, the
 
 
 def test_what_a_killed_import_began_does_not_meet_what_is_trained_here(good: Path, there: Path) -> None:
-    slow = items(STUDY, CODE, "own")[0]
+    slow = items(STUDY, "own")[0]
     tracker = MlflowTracker(study_card(STUDY), Home(there))
     tracker.start(slow.card._replace(imported="c0ffee")).log([{"step": 0.0, "eval/return": -777.0}])
     tracker.close("interrupted")
@@ -351,8 +355,11 @@ def config(change: Callable[[dict[str, Any]], Any]) -> Callable[[Path], None]:
         tree = json.loads(pq.read_table(folder / "runs.parquet")["config"][0].as_py())
         change(tree)
         text = json.dumps(tree, sort_keys=True, separators=(",", ":"))
-        key = f"{hashlib.sha256(text.encode()).hexdigest()[:12]}-{CODE}"
-        rows("runs", config=text, key=key)(folder)
+        try:
+            name = RunSpec.model_validate_json(text).id
+        except Exception:  # settings that nobody has
+            name = "0" * 12
+        rows("runs", config=text, key=f"{name}-{CODE}")(folder)
 
     return spoil
 
@@ -481,8 +488,8 @@ def bomb(state: dict[str, Any]) -> None:
     state["algorithm"]["x"] = inner
 
 
-POINT, CHECKPOINT = r"points\.parquet: ", r"checkpoints/[0-9a-f]{12}-c0dec0dec0de/00000001\.pt: "
-POLICY, RUN = r"policies/[0-9a-f]{12}-c0dec0dec0de\.pt: ", r"runs\.parquet: row 0: "
+POINT, CHECKPOINT = r"points\.parquet: ", r"checkpoints/[0-9a-f]{12}-[0-9a-f]{12}/00000001\.pt: "
+POLICY, RUN = r"policies/[0-9a-f]{12}-[0-9a-f]{12}\.pt: ", r"runs\.parquet: row 0: "
 ABOUT = r"bundle\.json: "
 DAMAGE: dict[str, tuple[Callable[[Path], Any], str]] = {
     # the manifest
@@ -510,6 +517,9 @@ DAMAGE: dict[str, tuple[Callable[[Path], Any], str]] = {
     "an unknown method": (about(params={"x": []}), ABOUT + "params: x: 'x' is not allowed; allowed: rhmc, "),
     "an unknown setting": (about(params={"iql": ["algo.l"]}), ABOUT + "params: iql: 0: 'algo.l' is not allowed; no"),
     "a fingerprint that is a path": (about(fingerprint="../x"), ABOUT + "fingerprint: '../x' is not allowed; .*match"),
+    "a fingerprint of all code": (about(fingerprint=CODE), ABOUT + "fingerprint: must be there in formats before 3"),
+    "a module that is none": (about(code={CODE: {"../x": CODE}}), ABOUT + "code: .*should match"),
+    "an adopted run that is a path": (about(adopted={"../x": "from"}), ABOUT + "adopted: .*should match"),
     "a commit that is no commit": (about(commit="x; rm"), ABOUT + "commit: 'x; rm' is not allowed"),
     "no plan": (about(plan=[]), ABOUT + "plan: must name the runs of the study"),
     "a plan of other runs": (about(plan=[["slow", "0" * 12 + "-" + CODE]]), RUN + "'slow s0' is not in the plan"),
@@ -543,11 +553,11 @@ DAMAGE: dict[str, tuple[Callable[[Path], Any], str]] = {
     ),
     "no settings": (rows("runs", config="{}"), RUN + "config: env: field required"),
     "settings that are none": (rows("runs", config="x"), RUN + "config: .*invalid JSON"),
-    "a method that nobody knows": (config(lambda c: c["algo"].update(kind="x")), RUN + "config: no settings that this"),
+    "a method that nobody knows": (config(lambda c: c["algo"].update(kind="x")), RUN + "config: algo: .*'x' is not"),
     "no method": (config(lambda c: c.update(algo=[])), RUN + r"config: algo: \[\] is not allowed; must be"),
-    "settings with a text for a number": (config(lambda c: c["algo"].update(lr="1e-4")), RUN + "config: .* in full"),
+    "settings with a text for a number": (config(lambda c: c["algo"].update(lr="1e-4")), RUN + "config: .* must be as"),
     "settings that are not finite": (config(lambda c: c["algo"].update(lr=float("inf"))), RUN + "config: .*finite"),
-    "settings left out": (config(lambda c: c["algo"].pop("lr")), RUN + "config: .* must be in full and sorted"),
+    "settings left out": (config(lambda c: c["algo"].pop("lr")), RUN + "params: 'algo.lr': '0.0001' is not allowed"),
     "a run twice": (again("runs"), r"runs\.parquet: row 3: 'slow' s0 is there twice"),
     "a seal that is none": (rows("runs", policy="x"), RUN + "policy: 'x' is not allowed"),
     "another seal": (rows("runs", policy="0" * 64), POLICY + "has changed since it was written"),
@@ -649,7 +659,7 @@ class Evil:
 
 
 def other_spec() -> str:
-    return items(STUDY, CODE, "")[3].spec.canonical()
+    return items(STUDY)[3].spec.canonical()
 
 
 def astray(state: Any) -> Any:
@@ -969,7 +979,7 @@ def assert_as_undisturbed(home: Path, undisturbed: Path) -> None:
     assert wrong | {"runs left open": 0} == dict.fromkeys(wrong, 0)
     assert found == expected
     assert tree(home) == tree(undisturbed)
-    late = items(STUDY, CODE, "")[2]
+    late = items(STUDY)[2]
     for file in Home(undisturbed).checkpoints(late.key).iterdir():
         assert file.read_bytes() == (Home(home).checkpoints(late.key) / file.name).read_bytes()
 
@@ -1018,7 +1028,7 @@ def test_a_disk_that_is_full_at_first(good: Path, tmp_path: Path, template: Path
 
 def test_what_killed_processes_left_is_swept(here: Path, good: Path, there: Path, tmp_path: Path) -> None:
     gone = f"{litter.HOST}-4194305"
-    late = items(STUDY, CODE, "")[2]
+    late = items(STUDY)[2]
     unfinished = [there / f"import.{gone}.part", tmp_path / f"b.zip.{gone}.part", tmp_path / f"b.zip.files.{gone}.part"]
     kept = [tmp_path / f"b.zip.elsewhere-{1}.part", tmp_path / f"other.zip.{gone}.part"]
     for folder in (*unfinished, *kept):

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -22,7 +23,7 @@ from pipelines import cli, yardsticks
 from pipelines.commands import ui
 from pipelines.commands.doctor import MARK
 from pipelines.doctor import Finding
-from pipelines.fingerprint import fingerprint
+from pipelines.identity import fingerprint
 from pipelines.side_by_side import KILLED
 from rhmc.yardsticks import names
 from tests.pipelines.fleet import wait_for
@@ -121,7 +122,7 @@ def test_the_page_of_the_command_line_names_every_verb() -> None:
     ("line", "offered"),
     [
         ("rhmc st", {"study"}),
-        ("rhmc study ", {"check", "run", "status", "list", "export", "import"}),
+        ("rhmc study ", {"check", "run", "status", "list", "export", "import", "adopt"}),
         ("rhmc study run studies/al", {"studies/alpha.yaml"}),
         ("rhmc study run studies/alpha.yaml --profile q", {"quick"}),
         ("rhmc search run studies/", {"studies/search_rhmc.yaml"}),
@@ -211,7 +212,7 @@ def test_status_for_scripts(rhmc: Rhmc) -> None:
     none = {"planned": 2, "finished": 0, "running": 0, "interrupted": 0, "failed": 0, "missing": 2, "stale": 0}
     assert (said.code, said.err) == (1, "")
     arms = {"full": none, "none": none}
-    expected = {"study": "x", "profile": "quick", "finished": False, "arms": arms, "errors": {}}
+    expected = {"study": "x", "profile": "quick", "finished": False, "arms": arms, "errors": {}, "stale": []}
     assert json.loads(said.out) == expected
 
 
@@ -560,6 +561,12 @@ def die(bank: yardsticks.Bank) -> None:
 
 
 # The rest
+
+
+def test_versions_are_said(rhmc: Rhmc) -> None:
+    code, out, err = rhmc("--version")
+    assert (code, err) == (0, "")
+    assert out.startswith(f"rhmc {version('rhmc')}, Python 3.")
 
 
 def test_fingerprint_is_printed_or_written_where_it_differs(rhmc: Rhmc) -> None:

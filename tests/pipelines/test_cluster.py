@@ -343,8 +343,6 @@ def nodes_of(home: Path) -> dict[str, tuple[str, list[str]]]:
 def test_a_study_survives_the_death_of_a_node(
     tmp_path: Path, template: Path, at_site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in ("export", "run", "bundle"):
-        monkeypatch.setattr(f"pipelines.{module}.fingerprint", lambda: CODE)
     home = tmp_path / "shared"
     home.mkdir()
     other = at_site.cluster.start()

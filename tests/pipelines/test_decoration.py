@@ -182,7 +182,7 @@ def test_a_plot_of_a_search_that_fails(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(search_run, "search_card", lambda _: Card)
     told: list[str] = []
     card = StudyCard("s", "quick", "", {}, [])
-    given: Any = (Search, [Some()], "code", MemoryTracker(card, []), Home(tmp_path), None, told.append)
+    given: Any = (Search, [Some()], MemoryTracker(card, []), Home(tmp_path), None, told.append)
     assert search_run.results(*given) == ([], [])
     assert told == ["IQL: plots: left out (ValueError: no ink)"]
 

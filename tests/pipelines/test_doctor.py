@@ -2,12 +2,26 @@
 
 import sys
 from contextlib import nullcontext
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 from pipelines import doctor
-from pipelines.doctor import Finding, disk, examine, libraries, locked, python, starts_ray, store, torch_build
+from pipelines.arithmetic import PUBLISHED
+from pipelines.doctor import (
+    Finding,
+    arithmetic,
+    disk,
+    examine,
+    libraries,
+    python,
+    required,
+    starts_ray,
+    store,
+    torch_build,
+)
 from pipelines.mlflow_tracker import MlflowTracker
 from pipelines.plan import study_card
 from pipelines.store import Home
@@ -15,23 +29,41 @@ from tests.pipelines.support import CODE, plan, tiny
 
 
 def test_another_python_is_a_fault() -> None:
-    assert python((3, 11))[0].level == "ok"
-    assert python((3, 12)) == [
-        Finding("fault", "python", "3.12, and 3.11 is needed: make setup PYTHON=/path/to/python3.11")
-    ]
+    assert [python((3, minor))[0].level for minor in (10, 11, 12, 13, 14)] == ["fault", "ok", "ok", "ok", "fault"]
+    text = "3.14, and one of 3.11, 3.12, 3.13 is needed: make setup PYTHON=/path/to/python3.11"
+    assert python((3, 14)) == [Finding("fault", "python", text)]
 
 
-def test_libraries_against_the_lock() -> None:
-    assert {"torch", "ray", "mlflow", "pydantic"} <= locked().keys()
-    assert libraries({"filelock": "0"})[0].level == "fault"
-    (found,) = libraries({"no-such-library": "1.0"} | dict.fromkeys(("torch", "numpy", "rich", "typer"), "0.1"))
+def test_libraries_against_the_lock(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    assert {"torch", "ray", "mlflow", "pydantic"} <= {one.name for one in required()}
+    assert libraries()[0].level == "ok"
+    assert libraries([Requirement("filelock==0")])[0].level == "fault"
+    names = ("torch", "numpy", "rich", "typer")
+    (found,) = libraries(map(Requirement, ["no-such-library==1.0", *(f"{name}==0.1" for name in names)]))
     assert found.text.startswith("no-such-library missing instead of 1.0, torch 2")
     assert found.text.endswith(" and 1 more: make setup")
-    assert libraries({})[0] == Finding("ok", "libraries", "all 0 as pinned")
+    assert libraries([])[0] == Finding("ok", "libraries", "all 0 as required")
+    monkeypatch.setattr(doctor, "LOCK", tmp_path / "no lock")  # installed from a wheel
+    assert {"torch", "ray"} <= {one.name for one in required()}
+    assert not {"pytest", "psycopg"} & {one.name for one in required()}
+    assert libraries()[0].level == "ok"
+    assert libraries([Requirement("torch>=2.13,<2.14")])[0].level == "ok"
+    assert libraries([Requirement("torch>=99")])[0].text == f"torch {torch_version()} instead of >=99: make setup"
+
+
+def torch_version() -> str:
+    return version("torch").partition("+")[0]
 
 
 def test_torch_computes_here() -> None:
     assert [(one.level, one.what) for one in torch_build()] == [("ok", "torch")]
+
+
+def test_arithmetic_is_that_of_the_published_results(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert arithmetic() == [Finding("ok", "arithmetic", "the published bytes")]
+    monkeypatch.setitem(PUBLISHED, "reductions", "0" * 12)
+    (found,) = arithmetic()
+    assert (found.level, found.text.partition(":")[0]) == ("note", "reductions")
 
 
 def test_room_and_rights(tmp_path: Path) -> None:
@@ -54,7 +86,7 @@ def test_a_store_that_is_none_or_not_there(tmp_path: Path) -> None:
 
 
 def test_what_waits_and_what_is_of_other_code(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipelines.fingerprint.fingerprint", lambda: CODE)
+    monkeypatch.setattr("pipelines.identity.code_id", lambda *place: CODE)
     tracker = MlflowTracker(study_card(tiny()), Home(home))
     slow, fast = plan()
     tracker.start(slow.card).finish("interrupted")
@@ -95,6 +127,6 @@ def test_an_examination_goes_on_after_a_fault(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(doctor, "LOCK", tmp_path / "none")
     monkeypatch.setattr(doctor, "requires", lambda name: ["torch==0.1", 'x==1; extra == "test"'])
     found = list(examine(tmp_path, ray=False))
-    assert [one.what for one in found] == ["python", "libraries", "torch", "code", "work folder", "store"]
+    assert [one.what for one in found] == ["python", "libraries", "torch", "arithmetic", "code", "work folder", "store"]
     assert found[1].level == "fault"
     assert str(sys.executable) in found[0].text

@@ -15,7 +15,7 @@ from pipelines.study import RunSpec, Study
 from rhmc.algorithms import ALGORITHMS
 from rhmc.trainer import Trainer
 from rhmc.types import Metrics
-from tests.pipelines.support import CODE, setting, spec, tiny
+from tests.pipelines.support import setting, spec, tiny
 
 
 def trained(one: RunSpec) -> tuple[Trainer, Metrics]:
@@ -39,7 +39,7 @@ def of_kind(kind: str, encoder: str) -> RunSpec:
 def policy(tmp_path: Path) -> tuple[Path, Metrics]:
     """A kept policy with its config beside it, and the run's last point."""
     trainer, last = trained(spec())
-    item = items(tiny(), CODE, "")[0]._replace(spec=spec())
+    item = items(tiny())[0]._replace(spec=spec())
     save_atomically(tmp_path / "policy.pt", without_replay(trainer.state_dict()))
     (tmp_path / "config.yaml").write_text(resolved_yaml(item, study_card(tiny())))
     return tmp_path / "policy.pt", last
@@ -89,9 +89,8 @@ def test_a_task_that_cannot_be_is_named_by_its_option(policy: tuple[Path, Metric
 
 
 def test_a_study_gives_the_policies_of_its_runs(home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipelines.evaluation.fingerprint", lambda: CODE)
     study: Study = tiny(points=2, arms={"done": setting(), "half": setting(lr=1e-2), "none": setting(lr=1.0)})
-    done, half, _ = items(study, CODE, "")
+    done, half, _ = items(study)
     tracker = MlflowTracker(study_card(study), Home(home))
     trainer, last = trained(done.spec)
     save_atomically(tmp_path / "policy.pt", without_replay(trainer.state_dict()))
@@ -121,10 +120,9 @@ def test_a_study_gives_the_policies_of_its_runs(home: Path, tmp_path: Path, monk
 def test_a_damaged_policy_of_the_log_is_named_by_its_run(
     home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipelines.evaluation.fingerprint", lambda: CODE)
     study = tiny()
     tracker = MlflowTracker(study_card(study), Home(home))
-    run = tracker.start(items(study, CODE, "")[0].card)
+    run = tracker.start(items(study)[0].card)
     (tmp_path / "policy.pt").write_bytes(b"weights")
     run.artifact(tmp_path / "policy.pt")
     run.finish("finished")
@@ -134,9 +132,8 @@ def test_a_damaged_policy_of_the_log_is_named_by_its_run(
 
 
 def test_a_run_under_way_is_read_and_left_alone(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipelines.evaluation.fingerprint", lambda: CODE)
     study = tiny(points=2)
-    item = items(study, CODE, "")[0]
+    item = items(study)[0]
     trainer = Trainer(item.spec.env, item.spec.algo, item.spec.trainer, item.spec.seed)
     checkpoints = Checkpoints(Home(home).checkpoints(item.key))
     next(trainer)

@@ -59,7 +59,7 @@ def test_one_row_per_metric_and_point(tracker: MemoryTracker, tmp_path: Path) ->
 
 
 def test_where_a_run_was_started_is_told_where_it_is_known(tracker: MemoryTracker, tmp_path: Path) -> None:
-    here, unknown = items(tiny(), CODE, "abc", Host("a machine", "torch 2"))[0], plan()[1]
+    here, unknown = items(tiny(), "abc", Host("a machine", "torch 2"))[0], plan()[1]
     log(tracker, here)
     log(tracker, unknown)  # of an earlier version, or brought in from elsewhere
     write_tables(tiny(), plan(), tracker, tmp_path)

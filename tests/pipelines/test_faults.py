@@ -7,7 +7,6 @@ import random
 import shutil
 import sqlite3
 import time
-from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
@@ -16,17 +15,11 @@ from mlflow import MlflowClient
 
 from pipelines.export import export_study
 from tests.pipelines.chaos import KILLED, Run, Server, damage, everything, faults, launch, start_launch
-from tests.pipelines.support import CODE, setting, tiny
+from tests.pipelines.support import setting, tiny
 
 RATES = {"slow": 1e-4, "fast": 1e-2, "twin": 1e-2}  # the last is copied from the one before
 STUDY = tiny(points=20, arms={arm: setting(lr=rate) for arm, rate in RATES.items()})
 NOTHING_WRONG = dict.fromkeys(faults([], []), 0)
-
-
-@pytest.fixture(autouse=True)
-def code(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same fingerprint in every process."""
-    monkeypatch.setattr("pipelines.export.fingerprint", lambda: CODE)
 
 
 class Whole:
@@ -39,10 +32,8 @@ class Whole:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory, template: Path) -> Iterator[Whole]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pipelines.export.fingerprint", lambda: CODE)
-        yield Whole(fresh(tmp_path_factory.mktemp("whole"), template))
+def whole(tmp_path_factory: pytest.TempPathFactory, template: Path) -> Whole:
+    return Whole(fresh(tmp_path_factory.mktemp("whole"), template))
 
 
 def fresh(folder: Path, template: Path) -> Path:

@@ -28,7 +28,7 @@ from pipelines.search_run import show_search
 from pipelines.store import Home, StoreError, work_folder
 from pipelines.trials import Ledger, look, open_storage, opened
 from rhmc.trainer import Trainer, grid_step
-from tests.pipelines.support import CODE, setting, tiny
+from tests.pipelines.support import setting, tiny
 
 HOSTILE = "#x ?y %2F z'\"~{a}\n"
 STUDY = tiny(arms={"one": setting(), "two": setting(lr=1e-2)})
@@ -45,14 +45,12 @@ steps: 200
 @pytest.fixture(autouse=True)
 def _code(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("OPTUNA_STORAGE", raising=False)
-    for module in ("bundle", "export", "evaluation", "run", "search_run"):
-        monkeypatch.setattr(f"pipelines.{module}.fingerprint", lambda: CODE)
 
 
 def log(home: Path, arm: int) -> str:
     """A finished run with its policy; gives its id."""
     tracker = MlflowTracker(study_card(STUDY), Home(home))
-    item = items(STUDY, CODE, "abc")[arm]
+    item = items(STUDY, "abc")[arm]
     logged = tracker.start(item.card)
     steps = [grid_step(item.spec.trainer, point) for point in range(4)]
     logged.log([*({"step": float(step), "eval/return": 1.0} for step in steps), {"step": 600.0, "final/return": 2.0}])
@@ -326,7 +324,7 @@ def searched(home: Path) -> Search:
     search = Search.load(home.parent / "search_x.yaml", "quick", [])
     with opened(Home(home)) as storage:
         assert storage is not None
-        assert Ledger(search, "one", CODE, storage).ask() is not None
+        assert Ledger(search, "one", storage).ask() is not None
     return search
 
 
@@ -405,13 +403,14 @@ def test_who_drives_a_study_is_seen_without_a_file_being_touched(old: Path) -> N
         assert not place.driven("tiny", "quick")
 
 
-def test_looking_at_a_search_makes_no_study_in_it(old: Path) -> None:
+def test_looking_at_a_search_makes_no_study_in_it(old: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     search = searched(old)
     storage = open_storage(Home(old), write=False)
     assert storage is not None
-    assert look(search, "one", CODE, storage)[0].counts()["running"] == 1
+    assert look(search, "one", storage)[0].counts()["running"] == 1
     before = (old / "optuna.db").read_bytes()
-    assert look(search, "one", "0ther", storage)[1] == 1
+    monkeypatch.setattr("pipelines.search.code_id", lambda *place: "0ther")
+    assert look(search, "one", storage)[1] == 1
     assert (old / "optuna.db").read_bytes() == before
 
 
@@ -429,7 +428,7 @@ def test_an_experiment_that_was_deleted_and_is_restored_is_said_once(
     class Display:
         say = staticmethod(said.append)
 
-    code = run.Code(CODE, "abc", run.host())
+    code = run.Code("abc", run.host())
     for _ in range(2):
         with pytest.raises(pytest.fail.Exception), run._logged(STUDY, code, Home(old), Display()):  # type: ignore[arg-type]
             pass

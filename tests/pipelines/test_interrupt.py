@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -20,24 +19,15 @@ from pipelines.plan import study_card
 from pipelines.run import run_studies
 from pipelines.store import Home
 from tests.pipelines.chaos import WORKER
-from tests.pipelines.support import CODE, started_by, tiny
+from tests.pipelines.support import started_by, tiny
 
 pytestmark = pytest.mark.ray
 POINTS = 30
 STUDY = tiny(points=POINTS)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def code() -> Iterator[None]:
-    """The same fingerprint in every process, should somebody edit the code meanwhile."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pipelines.run.fingerprint", lambda: CODE)
-        patch.setattr("pipelines.export.fingerprint", lambda: CODE)
-        yield
-
-
 @pytest.fixture(scope="module")
-def uninterrupted(tmp_path_factory: pytest.TempPathFactory, template: Path, cluster: None, code: None) -> bytes:
+def uninterrupted(tmp_path_factory: pytest.TempPathFactory, template: Path, cluster: None) -> bytes:
     """The export of a launch that nobody disturbed."""
     home = tmp_path_factory.mktemp("whole")
     shutil.copy(template, home / "mlflow.db")

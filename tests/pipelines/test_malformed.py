@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from pipelines import bundle, export
 from tests.pipelines.malformed import WRONG, Case, Outcome, Runner, cases, judge, look, make_base, prepared
 
 SEED = 1
@@ -14,11 +13,8 @@ KINDS = ("names", "search files", "included files", "paths that are no files", "
 
 
 @pytest.fixture(scope="module")
-def base(tmp_path_factory: pytest.TempPathFactory, template: Path) -> Iterator[Path]:
-    with pytest.MonkeyPatch.context() as patch:
-        for module in (bundle, export):
-            patch.setattr(module, "fingerprint", module.fingerprint)  # put back at the end
-        yield make_base(tmp_path_factory.mktemp("malformed"), template)
+def base(tmp_path_factory: pytest.TempPathFactory, template: Path) -> Path:
+    return make_base(tmp_path_factory.mktemp("malformed"), template)
 
 
 @pytest.fixture(scope="module")

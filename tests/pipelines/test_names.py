@@ -373,7 +373,7 @@ def test_names_in_json_stay_what_they_are(tmp_path: Path) -> None:
 
 def test_an_arm_that_is_asked_for_is_shown(tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
-        chosen(tiny(), "c0dec0dec0de", ["a\x1b\nb"])
+        chosen(tiny(), ["a\x1b\nb"])
     assert str(caught.value).startswith("--arm: 'a\\x1b\\nb' is not allowed; ")
 
 

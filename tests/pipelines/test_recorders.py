@@ -10,7 +10,6 @@ from rich.console import Console
 
 from pipelines import ray_driver
 from pipelines.errors import InputError
-from pipelines.fingerprint import fingerprint
 from pipelines.mlflow_tracker import MlflowTracker, open_existing
 from pipelines.plan import study_card
 from pipelines.progress import PlainBoard
@@ -21,7 +20,7 @@ from pipelines.store import Home, StoreError
 from pipelines.study import Study
 from pipelines.tracker import MemoryRun, MemoryTracker, StudyCard, points_of
 from tests.pipelines.chaos import fit_here
-from tests.pipelines.support import plan, setting, tiny
+from tests.pipelines.support import CODE, plan, setting, tiny
 
 POINTS = [{"step": float(step), "eval/return": step / 100} for step in (0, 200, 400)]
 FIRST = tiny("first")  # slow and fast
@@ -254,7 +253,7 @@ def test_the_locks_are_taken_in_one_order(home: Path, here: list[list[str]], mon
 def test_a_failure_of_the_second_study_is_one_of_the_launch(
     home: Path, here: list[list[str]], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    blocked = Home(home).checkpoints(f"{SECOND.runs()[1].spec.id}-{fingerprint()}")
+    blocked = Home(home).checkpoints(f"{SECOND.runs()[1].spec.id}-{CODE}")
     blocked.parent.mkdir(parents=True)
     blocked.touch()  # a file where the checkpoints should go
     assert run_studies([FIRST, SECOND], home) == 1
@@ -278,7 +277,7 @@ def test_a_study_that_is_driven_elsewhere_holds_up_the_launch(
 def test_what_was_finished_when_a_launch_broke_down_is_logged_so(
     home: Path, here: list[list[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    last = f"{SECOND.runs()[1].spec.id}-{fingerprint()}"
+    last = f"{SECOND.runs()[1].spec.id}-{CODE}"
     before = Recorder.result
 
     def full(self: Recorder, key: str, result: dict[str, Any]) -> None:

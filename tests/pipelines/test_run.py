@@ -26,7 +26,6 @@ from ruamel.yaml import YAML
 
 from pipelines import progress, ray_driver, run, trainable
 from pipelines.export import export_study
-from pipelines.fingerprint import fingerprint
 from pipelines.mlflow_tracker import MlflowTracker, open_existing
 from pipelines.plan import Item, commit, items, study_card, what_varies
 from pipelines.progress import LiveBoard, PlainBoard, duration
@@ -39,7 +38,7 @@ from pipelines.tracker import MemoryRun, MemoryTracker, StudyCard, points_of
 from rhmc.algorithms import iql
 from rhmc.trainer import Trainer
 from tests.pipelines.chaos import fit_here
-from tests.pipelines.support import plan, setting, spec, tiny
+from tests.pipelines.support import CODE, plan, setting, spec, tiny
 
 STUDY = StudyCard("tiny", "quick", "")
 POINTS = [{"step": float(step), "eval/return": step / 100, "time/steps_per_second": 50.0} for step in (0, 200, 400)]
@@ -362,7 +361,7 @@ def test_a_terminal_gets_a_line_per_running_run() -> None:
 
 def test_runs_of_a_killed_driver_are_not_said_to_be_running(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
     study = tiny()
-    plan = items(study, fingerprint(), "")
+    plan = items(study)
     MlflowTracker(study_card(study), Home(home)).start(plan[0].card)
 
     def slow() -> dict[str, int]:
@@ -565,7 +564,7 @@ def test_a_run_that_another_process_trains_is_trained_when_that_lets_go(
     monkeypatch.setattr(trainable, "PATIENCE", 0.0)
     monkeypatch.setattr(ray_driver, "fit", fit)
     monkeypatch.setattr(ray_driver, "ray_session", lambda *args: nullcontext([]))
-    key = f"{tiny().runs()[0].spec.id}-{fingerprint()}"
+    key = f"{tiny().runs()[0].spec.id}-{CODE}"
     Home(home).checkpoints(key).parent.mkdir()
     held = FileLock(f"{Home(home).checkpoints(key)}.lock")
     held.acquire()
@@ -578,7 +577,7 @@ def test_a_run_that_another_process_trains_is_trained_when_that_lets_go(
 def test_run_skip_fail_and_retry(home: Path, cluster: None, capsys: pytest.CaptureFixture[str]) -> None:
     study = tiny()
     slow, fast = study.runs()
-    blocked = Home(home).checkpoints(f"{slow.spec.id}-{fingerprint()}")
+    blocked = Home(home).checkpoints(f"{slow.spec.id}-{CODE}")
     blocked.parent.mkdir()
     blocked.touch()  # a file where the checkpoints of `slow` should go
 

@@ -113,13 +113,15 @@ def test_an_override_changes_the_budget_of_all() -> None:
 
 
 def test_more_trials_continue_a_search_and_anything_else_begins_another() -> None:
-    def identity(text: str, code: str = CODE) -> str:
-        return load(text).identity("IQL", code)
+    def identity(text: str) -> str:
+        return load(text).identity("IQL")
 
     first = identity(GOOD)
     assert identity(changed("quick: 5", "quick: 50")) == first
     assert identity(GOOD.replace("high: 32", "high: 31")) == first  # of the other arm
-    assert identity(GOOD, "0ther") != first
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pipelines.search.code_id", lambda *place: "0ther")
+        assert identity(GOOD) != first
     for old, new in [
         ("high: 0.9", "high: 0.8"),
         ("seeds: 2", "seeds: 3"),
@@ -339,7 +341,7 @@ class World:
         self.out = StringIO()
 
     def ledgers(self) -> list[Ledger]:
-        return [Ledger(self.search, arm, CODE, self.storage) for arm in self.search.arms]
+        return [Ledger(self.search, arm, self.storage) for arm in self.search.arms]
 
     def launch(self, shape: Curve = curve, size: int = 1, twin: Twin | None = None) -> Twin:
         ledgers = self.ledgers()
@@ -347,7 +349,7 @@ class World:
             ledger.take_up()
         workers = twin or Twin(self.disk, shape, size)
         tracker = MemoryTracker(search_card(self.search), self.shelf)
-        book = Book(self.search, CODE, tracker, PlainBoard(Console(file=self.out)))
+        book = Book(self.search, tracker, PlainBoard(Console(file=self.out)))
         Drive(self.search, ledgers, workers, book, Home(self.folder), self.folder / "stop").run()
         return workers
 
@@ -367,7 +369,7 @@ class World:
         for ledger in self.ledgers():
             best = ledger.best()
             assert best is not None
-            texts.append(winner_yaml(self.search, ledger.arm, best, ledger.counts(), CODE))
+            texts.append(winner_yaml(self.search, ledger.arm, best, ledger.counts()))
         return texts
 
 
@@ -615,7 +617,7 @@ def test_the_winner_says_where_it_comes_from_and_a_study_includes_it(tmp_path: P
     world = World(search, tmp_path)
     world.launch()
     tracker = MemoryTracker(search_card(search), world.shelf)
-    written = results(search, world.ledgers(), CODE, tracker, Home(tmp_path), Path("studies/found"))
+    written = results(search, world.ledgers(), tracker, Home(tmp_path), Path("studies/found"))
     assert [str(file) for file in written.winners] == [
         "studies/found/search_x.iql.quick.yaml",
         "studies/found/search_x.vdn.quick.yaml",
@@ -709,9 +711,11 @@ def test_status_before_anything_ran_makes_nothing(tmp_path: Path, capsys: pytest
 def test_trials_of_other_code_are_stale(tmp_path: Path) -> None:
     world = World(load(), tmp_path)
     world.launch()
-    ledger, stale = look(world.search, "IQL", "0ther", world.storage)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pipelines.search.code_id", lambda *place: "0ther")
+        ledger, stale = look(world.search, "IQL", world.storage)
     assert (ledger.closed, stale) == (0, 5)
-    ledger, stale = look(world.search, "IQL", CODE, world.storage)
+    ledger, stale = look(world.search, "IQL", world.storage)
     assert (ledger.closed, stale) == (5, 0)
 
 

@@ -98,7 +98,6 @@ from pipelines import ray_driver, run, streams
 from tests.pipelines.chaos import fit_here
 from tests.pipelines.support import CODE, tiny
 streams.settle()
-run.fingerprint = lambda: CODE
 ray_driver.ray_session = lambda *args: nullcontext([])
 ray_driver.fit = fit_here
 sys.exit(run.run_studies([tiny()], Path(sys.argv[1])))
@@ -203,10 +202,9 @@ def test_a_launch_says_it_once(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
 
     from pipelines import ray_driver, run
     from tests.pipelines.chaos import fit_here
-    from tests.pipelines.support import CODE, tiny
+    from tests.pipelines.support import tiny
 
     monkeypatch.setattr(run, "read_commit", lambda: Commit("unknown", "git is not installed"))
-    monkeypatch.setattr(run, "fingerprint", lambda: CODE)
     monkeypatch.setattr(ray_driver, "ray_session", lambda *args: nullcontext([]))
     monkeypatch.setattr(ray_driver, "fit", fit_here)
     assert run.run_studies([tiny("a"), tiny("b")], home) == 0

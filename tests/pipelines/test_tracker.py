@@ -141,10 +141,10 @@ def test_a_launch_leaves_other_studies_alone(opened: Open) -> None:
 
 def test_a_finished_run_is_found_from_another_study(opened: Open) -> None:
     run = opened(OTHER).start(CARD)
-    assert opened().finished_anywhere("c0de") == {}
+    assert opened().finished_anywhere([CARD.key]) == {}
     run.finish("finished")
-    assert opened().finished_anywhere("c0de") == {CARD.key: run.ref}
-    assert opened().finished_anywhere("changed") == {}
+    assert opened().finished_anywhere([CARD.key, "more"]) == {CARD.key: run.ref}
+    assert opened().finished_anywhere(["5pec-changed"]) == {}
 
 
 def test_no_number_is_a_number_too(opened: Open) -> None:

@@ -1,0 +1,38 @@
+"""Settings under which torch computes the same bytes on every x86-64 processor with AVX2.
+
+torch and the libraries below it choose instructions by the processor that they find, and other instructions round
+otherwise. Here they are told to use those that all such processors have. They read it at their first operation, so
+importing `rhmc` before anything is computed is enough. What was compared, and where: `docs/reproducibility.md`.
+"""
+
+import os
+import platform
+from pathlib import Path
+
+SETTINGS = {
+    "ATEN_CPU_CAPABILITY": "avx2",  # torch's own kernels: exp, tanh, softmax
+    "MKL_CBWR": "AVX2",  # products of matrices
+    "ONEDNN_MAX_CPU_ISA": "AVX2",
+}
+CAPABILITY = "AVX2"  # what torch then says of itself
+CPUINFO = Path("/proc/cpuinfo")
+
+
+def apply() -> None:
+    """Put the settings into the environment, in place of what is there: a run's name stands for its bytes."""
+    if possible():
+        os.environ.update(SETTINGS)
+
+
+def possible() -> bool:
+    """Whether this processor has the instructions; results of another kind are its own."""
+    if platform.machine().lower() not in {"x86_64", "amd64"}:
+        return False
+    return not CPUINFO.exists() or "avx2" in CPUINFO.read_text(encoding="utf-8").split()
+
+
+def active() -> bool:
+    """Whether torch follows the settings; not if it computed something before they were made."""
+    import torch
+
+    return not possible() or torch.backends.cpu.get_cpu_capability() == CAPABILITY

@@ -1,0 +1,127 @@
+"""Digests of results that must not change unnoticed: `python -m tests.golden` prints them, `--write` keeps them.
+
+A digest that changes is either another arithmetic, and then `pipelines.arithmetic` names the operations, or a change of
+the code that changes results, which is said in the changelog and ages the runs that it concerns.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from torch import Tensor
+
+from pipelines.export import write_tables
+from pipelines.plan import items, study_card
+from pipelines.study import Setting
+from pipelines.tracker import MemoryTracker
+from rhmc.algorithms import ALGORITHMS
+from rhmc.envs import ENVS
+from rhmc.trainer import Trainer
+from rhmc.yardsticks import yardsticks
+from tests.pipelines.support import tiny
+
+FILE = Path(__file__).with_name("digests.json")
+DIGITS = 12
+SMALL = {  # widths as in the studies, where the processor chooses its instructions; everything else small
+    "encoder": "pairwise",
+    "pretrain": 600,
+    "buffer": 1000,
+    "batch": 64,
+    "batch_h": 64,
+    "warmup": 256,
+    "steps_per_update": 32,
+    "rollout": 10,
+    "epochs": 2,
+    "minibatches": 2,
+}
+RUN = {"steps": 1600, "num_envs": 32, "evaluations": 2, "eval_episodes": 10, "final_episodes": 10}
+VARIANTS: dict[str, dict[str, Any]] = {  # beside every method in every task
+    "rhmc exact": {
+        "kind": "rhmc",
+        "regulator": "exact",
+        "horizon": 6,
+        "coordinator": "counterfactual",
+        "executor": "expected",
+        "assignment_period": 5,
+        "standardise_h": "reward",
+    },
+    "rhmc mixed": {"kind": "rhmc", "executor": "mixed", "low_reward": "team"},
+    "qmix mlp": {"kind": "qmix", "encoder": "mlp", "standardise": "return"},
+    "mappo kl": {"kind": "mappo", "objective": "kl_adaptive", "encoder": "mlp"},
+}
+
+
+def cases() -> dict[str, Callable[[], str]]:
+    """What is digested, by name; calling one takes a second or two."""
+    kinds = {kind: {"kind": kind} for kind in ALGORITHMS} | VARIANTS
+    found = {f"{name} in {task}": _training(task, algo) for name, algo in kinds.items() for task in ENVS}
+    found["maddpg in continuous navigation"] = _training("navigation", {"kind": "maddpg"}, continuous=True)
+    found |= {f"yardsticks of {task}": _yardsticks(task) for task in ENVS}
+    return found | {"exported table": _table}
+
+
+def setting(task: str, algo: dict[str, Any], **env: Any) -> Setting:
+    """A short training."""
+    fields = ALGORITHMS[algo["kind"]].config.model_fields
+    small = {name: value for name, value in SMALL.items() if name in fields}
+    task_fields = {"kind": task, "observation": "extended", **env}
+    return Setting.model_validate({"env": task_fields, "algo": small | algo, "trainer": RUN})
+
+
+def _training(task: str, algo: dict[str, Any], **env: Any) -> Callable[[], str]:
+    """Every point of the curve, the finals among them, and all that the method has learned."""
+
+    def run() -> str:
+        one = setting(task, algo, **env)
+        trainer = Trainer(one.env, one.algo, one.trainer, 0)
+        return digest([list(trainer), [learner.state_dict() for learner in trainer.algorithm.learners()]])
+
+    return run
+
+
+def _yardsticks(task: str) -> Callable[[], str]:
+    return lambda: digest(yardsticks(ENVS[task].config(), episodes=4, seed=1))
+
+
+def _table() -> str:
+    """The bytes of a study's exported values, as its report reads them; not of its runs, which name the code."""
+    study = tiny()
+    tracker = MemoryTracker(study_card(study), [])
+    for item in items(study):
+        log = tracker.start(item.card)
+        log.log(list(Trainer(item.spec.env, item.spec.algo, item.spec.trainer, item.spec.seed)))
+        log.finish("finished")
+    with TemporaryDirectory() as folder:
+        write_tables(study, items(study), tracker, Path(folder))
+        return hashlib.sha256((Path(folder) / f"{study.name}.parquet").read_bytes()).hexdigest()[:DIGITS]
+
+
+def digest(tree: Any) -> str:
+    """Of numbers and tensors in dicts and lists, bit for bit."""
+    whole = hashlib.sha256()
+    for part in _leaves(tree):
+        whole.update(part)
+    return whole.hexdigest()[:DIGITS]
+
+
+def _leaves(tree: Any) -> Iterator[bytes]:
+    if isinstance(tree, Tensor):
+        yield tree.detach().cpu().contiguous().numpy().tobytes()
+    elif isinstance(tree, dict):
+        for key in sorted(tree, key=str):
+            yield str(key).encode()
+            yield from _leaves(tree[key])
+    elif isinstance(tree, list | tuple):
+        for value in tree:
+            yield from _leaves(value)
+    else:
+        yield (tree.hex() if isinstance(tree, float) else str(tree)).encode()
+
+
+def kept() -> dict[str, str]:
+    """The digests in the repository."""
+    found: dict[str, str] = json.loads(FILE.read_text(encoding="utf-8"))
+    return found

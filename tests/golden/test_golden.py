@@ -1,0 +1,53 @@
+"""The results are those of before, to the last bit."""
+
+import subprocess
+import sys
+
+import pytest
+
+from pipelines.arithmetic import PUBLISHED, differing, operations
+from rhmc.portable import SETTINGS, active
+from tests.golden import cases, kept
+
+CASES = cases()
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_golden(name: str) -> None:
+    found = CASES[name]()
+    if found != kept().get(name):
+        others = differing()
+        why = f"this machine computes otherwise: {', '.join(others)} (docs/reproducibility.md)"
+        changed = "the code changes results: if it is meant to, `python -m tests.golden --write` and the changelog"
+        pytest.fail(f"{name}: {found} instead of {kept().get(name)}; {why if others else changed}")
+
+
+def test_every_golden_digest_is_looked_at() -> None:
+    assert set(kept()) == set(CASES)
+
+
+def test_operations_give_the_published_bytes() -> None:
+    assert active()
+    assert operations() == PUBLISHED
+
+
+# Ways into the program: each has to settle the arithmetic before anything is computed.
+WAYS = {
+    "torch first": "import torch\nimport rhmc",
+    "the science": "from rhmc.trainer import Trainer",
+    "studies": "from pipelines.study import Study",
+    "a worker": "from pipelines.trainable import RunTrainable",
+    "a model of MLflow": "from pipelines.served import ServedPolicy",
+    "command line": "import pipelines.cli\nfrom pipelines.evaluation import score",
+    "benchmark": "import sys\nsys.path.insert(0, 'benchmarks')\nimport train_speed",
+    "golden": "import tests.golden",
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_the_arithmetic_is_settled_however_one_comes_in(way: str) -> None:
+    """Also where somebody has set something else before."""
+    program = f"{WAYS[way]}\nfrom pipelines.arithmetic import operations\nprint(operations())"
+    hostile = dict.fromkeys(SETTINGS, "default") | {"MKL_CBWR": "COMPATIBLE", "PATH": "/usr/bin:/bin"}
+    said = subprocess.run([sys.executable, "-c", program], env=hostile, capture_output=True, text=True, check=True)
+    assert said.stdout.strip().splitlines()[-1] == str(PUBLISHED)
