@@ -91,7 +91,7 @@ def test_index(made: Path) -> None:
     ]
     assert [text.index(part) for part in parts] == sorted(text.index(part) for part in parts)
     assert "no such arm yet: HiT-MAC, QMIX, COMA, MAPPO, MADDPG" in text
-    assert "code fingerprint `0123456789ab`, commit `c0ffee`" in text
+    assert "code `0123456789ab`, commit `c0ffee`" in text
     assert "mean over seeds of final/return" in text
     linked = [part.split(")")[0] for part in text.split("](")[1:]]
     assert [link for link in linked if not link.startswith("#") and not (made / link).exists()] == []
