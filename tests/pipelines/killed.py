@@ -281,7 +281,7 @@ def end_of(verb: Verb, home: Path) -> End:
     files = {str(path.relative_to(home)): path for path in sorted(home.rglob("*")) if path.is_file()}
     written = {name: path.read_bytes() for name, path in files.items() if name.startswith(f"{OUT}/")}
     if verb.act is stage or verb.act is exported:
-        written = {name: content for name, content in written.items() if not name.endswith(".runs.parquet")}  # seconds
+        written = {name: content for name, content in written.items() if not name.endswith(".made.parquet")}  # seconds
     return End(runs, written, Counter(UNNAMED.sub("*", name) for name in files))
 
 

@@ -81,6 +81,21 @@ def test_what_is_published_is_small_and_verified(exported: Path) -> None:
     assert again.read_bytes() == (publish(values, runs, "quick") / "results.parquet").read_bytes()
 
 
+def test_what_is_published_by_the_command_is_equal_to_what_it_is_of(exported: Path, tmp_path: Path) -> None:
+    for file in exported.iterdir():
+        if not file.name.endswith(".made.parquet"):
+            (tmp_path / file.name).write_bytes(file.read_bytes())
+    said = verify("--publish", "--runs", tmp_path)
+    assert said == (0, "wrote reports/published/quick\n")
+    assert sorted(file.name for file in folder("quick").iterdir()) == ["results.parquet", "results.runs.parquet"]
+    assert verify("--runs", exported) == (0, "byte-equal to the published quick results: 2 arms\n")
+    moved = verify("--runs", edited(exported, tmp_path / "a", 3.0, "fast"))
+    assert (moved.code, moved.text.splitlines()[-1]) == (
+        1,
+        "against the published quick results: 1 arms not shown to be equivalent, 1 arms byte-equal",
+    )
+
+
 def test_shifted_arms(exported: Path, tmp_path: Path) -> None:
     publish(*read(exported), "quick")
     said = verify("--runs", edited(exported, tmp_path / "a", 3.0, "fast"))

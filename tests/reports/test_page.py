@@ -140,6 +140,17 @@ def test_machine_and_versions_where_they_are_exported(tmp_path: Path) -> None:
     assert "The runs were not all made by the same code." in text
 
 
+def test_a_page_without_how_the_runs_were_made(tmp_path: Path) -> None:
+    folder = write(tmp_path, study("coverage", {"RHMC": noisy(67), "IQL": noisy(63)}, points=4))
+    (folder / "coverage.made.parquet").unlink()
+    build(folder, tmp_path / "out", "quick")
+    text = Reader((tmp_path / "out" / "index.html").read_text()).text
+    assert "Machine not exported Versions not exported Processor time of all runs not exported" in text
+    assert "commit unknown." in (tmp_path / "out" / "index.md").read_text()
+    assert not (tmp_path / "out" / "measured" / "time_coverage.csv").exists()
+    assert pd.read_csv(tmp_path / "out" / "measured" / "made.csv")["commit"].isna().all()
+
+
 def test_one_study(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arms = {"one": noisy(67), "two": noisy(63), "three": noisy(50)}
     runs = write(tmp_path / "runs", study("reach", arms, points=4), study("other", {"x": noisy(1)}), yardsticks())

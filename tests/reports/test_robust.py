@@ -25,7 +25,7 @@ from tests.reports.factory import drawings, episode, methods, noisy, study, writ
 from tests.reports.hostile import Page
 
 pytestmark = pytest.mark.usefixtures("quick_resampling")
-POINTS, RUNS = "reach.parquet", "reach.runs.parquet"
+POINTS, RUNS, MADE = "reach.parquet", "reach.runs.parquet", "reach.made.parquet"
 Plant = Callable[[Path], Any]
 
 
@@ -100,7 +100,7 @@ REFUSED: dict[str, tuple[Plant, str]] = {
         "says '../../x'; a table of that name is of study 'reach'",
     ),
     "a numbered code": (edit(RUNS, "fingerprint", lambda _: 7), "column 'fingerprint' holds int64, not words"),
-    "worded seconds": (edit(RUNS, "seconds", lambda _: "x"), "column 'seconds' holds words, not numbers"),
+    "worded seconds": (edit(MADE, "seconds", lambda _: "x"), "column 'seconds' holds words, not numbers"),
     "no status": (edit(RUNS, "status", lambda _: None), "column 'status'"),
     "no configuration": (edit(RUNS, "config", lambda _: None), "column 'config'"),
     "a list for a task": (config('{"env": [], "trainer": "x"}'), "column 'config' holds env: Input should be"),
@@ -162,7 +162,7 @@ def test_a_table_of_another_form_is_a_line_and_the_old_report_stays(
         edit(POINTS, "value", lambda t: t["value"].astype("float32").astype(float)),
         edit(RUNS, "more", lambda t: [[1]] * len(t)),
         edit(RUNS, "question", lambda _: None),
-        edit(RUNS, "seconds", lambda _: None),
+        edit(MADE, "seconds", lambda _: None),
     ],
     ids=["a dictionary of words", "small", "whole floats", "floats", "more columns", "no question", "no seconds"],
 )
