@@ -88,6 +88,16 @@ def test_missing_seeds_and_other_settings_do_not_hold() -> None:
     assert outcome(changed, published) == "other settings"
 
 
+def test_several_runs_of_an_arm_and_seed_are_told_apart() -> None:
+    """As of a yardstick, which has one for each task."""
+    published = pd.concat([tables(a=[60.0]), tables(a=[20.0]).assign(run="0ther")], ignore_index=True)
+    assert outcome(published.sample(frac=1, random_state=0), published) == "byte-equal"
+    here = published.copy()
+    here.loc[here["run"] == "0ther", "value"] += 1.0
+    assert {one.published for one in differing(here, published)} <= set(published[published["run"] == "0ther"]["value"])
+    assert finals(published).tolist() == finals(published.iloc[::-1]).tolist()
+
+
 def test_more_seeds_here_than_published_do_no_harm() -> None:
     assert outcome(tables(a=SEEDS), tables(a=SEEDS[:2])) == "byte-equal"
 
