@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import t
 
 from reports.frame import TableError
-from reports.stats import equivalence
+from reports.stats import equivalence, equivalence_of_pairs
 from reports.verify import compare, differing, finals, read, summary, table
 from tests.reports import factory
 
@@ -122,6 +122,16 @@ def test_equivalence_where_there_is_little_to_go_by() -> None:
     assert np.isnan(equivalence(one, two, 1.0))
     assert equivalence(two, two + 0.5, 1.0) == 0.0
     assert equivalence(two, two + 1.0, 1.0) == 1.0
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.8, -0.8, 1.2, -1.2])
+def test_equivalence_of_pairs_against_its_formula(shift: float) -> None:
+    gaps = np.array([0.1, -0.2, 0.05, 0.3]) + shift
+    mean, se = gaps.mean(), gaps.std(ddof=1) / 2
+    assert equivalence_of_pairs(gaps, 1.0) == pytest.approx(max(t.sf((mean + 1) / se, 3), t.cdf((mean - 1) / se, 3)))
+    assert np.isnan(equivalence_of_pairs(gaps[:1], 1.0))
+    assert equivalence_of_pairs(np.array([0.5, 0.5]), 1.0) == 0.0
+    assert equivalence_of_pairs(np.array([-1.0, -1.0]), 1.0) == 1.0
 
 
 def test_folders_are_read_whole_or_not_at_all(tmp_path: Path) -> None:
