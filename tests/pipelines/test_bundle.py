@@ -119,6 +119,23 @@ def picture(home: Path) -> dict[str, Any]:
 # The way there
 
 
+def test_a_policy_of_a_method_that_bounds_nothing_travels(home: Path, there: Path, tmp_path: Path) -> None:
+    """RHMC without a regulator keeps half-done periods whose bound is minus infinity."""
+    settled = {"kind": "rhmc", "regulator": "none", "high_reward": "team", "filter": "off"}
+    study = tiny(arms={"free": setting(**settled)})
+    (item,) = items(study)
+    trainer = Trainer(item.spec.env, item.spec.algo, item.spec.trainer, item.spec.seed)
+    run = MlflowTracker(study_card(study), Home(home)).start(item.card)
+    run.log(list(trainer))
+    state = without_replay(trainer.state_dict())
+    assert not state["algorithm"]["pending"]["bound"].isfinite().any()
+    save_atomically(tmp_path / "policy.pt", state | {SPEC: item.spec.canonical()})
+    run.artifact(tmp_path / "policy.pt")
+    run.finish("finished")
+    pack(study, tmp_path / "b", home)
+    assert unpack(tmp_path / "b", there) == Taken(study.name, study.profile, 1, 0, 0, 0)
+
+
 @pytest.mark.parametrize("name", ["bundle", "bundle.zip"])
 def test_there_is_what_was_here(here: Path, there: Path, tmp_path: Path, name: str) -> None:
     out = tmp_path / name

@@ -123,6 +123,27 @@ def test_a_missing_seed_other_settings_and_another_profile(exported: Path, tmp_p
     assert verify("--profile", "paper", "--runs", exported).code == 2
 
 
+def test_yardsticks_among_the_published_results_are_not_looked_for_in_a_log(
+    exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with_yardsticks = tmp_path / "all"
+    with_yardsticks.mkdir()
+    for file in exported.iterdir():
+        (with_yardsticks / file.name).write_bytes(file.read_bytes())
+        table = pd.read_parquet(file).assign(study="yardsticks")
+        if "algorithm" in table:
+            table["algorithm"] = "scripted"
+        table.to_parquet(with_yardsticks / file.name.replace("tiny", "yardsticks"))
+    said = verify("--published", with_yardsticks, "--runs", with_yardsticks)
+    assert said == (0, "byte-equal to the published quick results: 4 arms\n")
+    again = verify("--published", with_yardsticks, "--retrain", "9", "--jobs", "1")
+    assert again == (0, "byte-equal to the published quick results: 4 arms\n"), "the four trained runs"
+    asked: list[str] = []
+    monkeypatch.setattr("pipelines.published.export_log", lambda studies, *_: asked.extend(studies))
+    verify("--published", with_yardsticks)
+    assert asked == ["tiny"]
+
+
 def test_unfinished_results_are_not_published(tmp_path: Path) -> None:
     export(STUDY, tmp_path / "half", runs=3)
     with pytest.raises(InputError, match=r"1 of 4 runs are not finished"):
