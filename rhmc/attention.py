@@ -15,6 +15,7 @@ from torch.nn.functional import logsigmoid, mse_loss, scaled_dot_product_attenti
 from rhmc import checkpoint
 from rhmc.experience import flat, minibatches, values
 from rhmc.learner import Learner, Learners, unpack
+from rhmc.linear import Linear
 from rhmc.nets import ENCODERS, EncoderName, Sizes, mlp
 from rhmc.ppo import normalised
 from rhmc.returns import gae
@@ -43,7 +44,7 @@ class Attended(nn.Module):
     def __init__(self, encoder: EncoderName, sizes: Sizes, hidden: int) -> None:
         super().__init__()
         self.embed = ENCODERS[encoder].pairs(sizes, hidden, hidden)
-        self.project = nn.Linear(hidden, 3 * hidden)
+        self.project = Linear(hidden, 3 * hidden)
 
     def forward(self, obs: Obs) -> Tensor:
         own = self.embed(obs).flatten(1, 2).relu()
@@ -56,7 +57,7 @@ class Assigner(nn.Module):
 
     def __init__(self, encoder: EncoderName, sizes: Sizes, hidden: int) -> None:
         super().__init__()
-        self.body, self.head = Attended(encoder, sizes, hidden), nn.Linear(hidden, 1)
+        self.body, self.head = Attended(encoder, sizes, hidden), Linear(hidden, 1)
 
     def forward(self, obs: Obs) -> Tensor:
         return self.head(self.body(obs)).view(obs.pairs.shape[:3])

@@ -263,7 +263,7 @@ EDITS = {
         set(ALGORITHMS),
         set(ENVS),
     ),
-    "arithmetic": ("portable.py", '"MKL_CBWR": "AVX2"', '"MKL_CBWR": "COMPATIBLE"', set(ALGORITHMS), set(ENVS)),
+    "arithmetic": ("portable.py", '"MKL_CBWR": "COMPATIBLE"', '"MKL_CBWR": "AVX2"', set(ALGORITHMS), set(ENVS)),
     "an init that fills a table": (
         "algorithms/__init__.py",
         "# isort: off\n",
