@@ -26,7 +26,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_NO_INPUT := 1
 unexport PYTHONPATH
 
-.PHONY: help setup repro test check bench soak report ui lock clean
+.PHONY: help setup repro test deep check bench soak report ui lock clean
 
 help: ## What there is to make
 	@grep -hE '^[a-z]+:.*## ' Makefile | sed -E 's/^([a-z]+):[^#]*## /  make \1\t/' | expand -t 14
@@ -41,7 +41,10 @@ repro: $(READY) ## Train, track and report on the profile in params.yaml; an int
 	@echo "MLflow UI: run \`make ui\` and open the address that it prints"
 
 test: check ## Lint, types and every test
-	@python -m pytest -n $(JOBS)
+	@python -m pytest -n $(JOBS) --dist loadgroup
+
+deep: $(READY) ## Every test, with many more random kills and examples: before a release
+	@DEEP=1 python -m pytest -n $(JOBS) --dist loadgroup
 
 check: $(READY) ## Lint and types only
 	@ruff check --quiet .

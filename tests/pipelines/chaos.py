@@ -43,7 +43,10 @@ from pipelines.tracker import StudyCard
 from pipelines.trainable import RunTrainable
 
 ray.tune.trainable.trainable.DEFAULT_STORAGE_PATH = tempfile.gettempdir() + "/ray_results"  # not in a tester's home
-PRELOAD = ["mlflow.server", "mlflow.store.tracking.sqlalchemy_store"]
+PRELOAD = [  # whatever a launch or another verb imports: a forked process has it at once
+    *("mlflow.server", "mlflow.store.tracking.sqlalchemy_store", "torch._dynamo"),
+    *("pipelines.animation", "pipelines.bundle", "pipelines.registry", "pipelines.search_plots", "reports.build"),
+]
 FORKS = multiprocessing.get_context("forkserver")
 WRITES = ("INSERT", "UPDATE", "DELETE")
 KILLED = -signal.SIGKILL

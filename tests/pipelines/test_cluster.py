@@ -42,6 +42,7 @@ from tests.pipelines.fleet import (
 )
 from tests.pipelines.support import CODE, plan, setting, tiny
 
+pytestmark = pytest.mark.xdist_group("cluster")  # its fixtures take seconds to make
 PROGRAMS = postgres_programs()
 needs_postgres = pytest.mark.skipif(
     PROGRAMS is None, reason="PostgreSQL's initdb and postgres are neither on PATH nor in /usr/lib/postgresql"
@@ -356,7 +357,7 @@ def test_a_study_survives_the_death_of_a_node(
             return None
         return there[0] if list(home.glob(f"checkpoints/{there[0]}/0*.pt")) else None
 
-    with driver(["tests.pipelines.support", str(home), str(POINTS)], at_site, home) as launched:
+    with driver(["tests.pipelines.support", str(home), str(POINTS), "2"], at_site, home) as launched:
         victim = wait_for(on_the_other, "training on both nodes")
         other.kill()
         out = launched.end()
