@@ -23,6 +23,7 @@ from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import pytest
 import ray.tune.trainable.trainable
 import torch
 from mlflow.entities import ViewType
@@ -265,6 +266,14 @@ def fit_here(jobs: list[dict[str, Any]], recorder: Recorders, *rest: Any) -> Non
             done = result["done"]
             recorder.result(job["key"], result)
         worker.cleanup()
+
+
+def launch_here(study: Study, home: Path) -> int:
+    """The exit code of a launch in this process, without Ray."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ray_driver, "ray_session", lambda *args: nullcontext([]))
+        patch.setattr(ray_driver, "fit", fit_here)
+        return run.run_studies([study], home)
 
 
 class Server:

@@ -29,7 +29,7 @@ from pipelines.store import Home, StoreError
 from pipelines.study import Setting
 from pipelines.trainable import RunTrainable
 from rhmc.types import Metrics
-from tests.pipelines.chaos import everything, faults, launch
+from tests.pipelines.chaos import everything, faults, launch_here
 from tests.pipelines.fleet import (
     ROOT,
     Cluster,
@@ -384,7 +384,7 @@ def assert_as_undisturbed(
         whole = folder / "whole"
         whole.mkdir()
         shutil.copy(template, whole / "mlflow.db")
-        assert launch(STUDY, whole) == 0, (whole / "driver.log").read_text()
+        assert launch_here(STUDY, whole) == 0
         assert export_study(STUDY, whole / "out", whole) == 0
         expected = everything(STUDY, whole)
     assert faults(found, expected) == dict.fromkeys(faults([], []), 0)

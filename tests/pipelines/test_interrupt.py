@@ -12,31 +12,22 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 
-from pipelines import ray_driver
 from pipelines.export import export_study
 from pipelines.mlflow_tracker import open_existing
 from pipelines.plan import study_card
 from pipelines.run import run_studies
 from pipelines.store import Home
-from tests.pipelines.chaos import WORKER, fit_here
+from pipelines.study import Study
+from tests.pipelines.chaos import WORKER, launch_here
 from tests.pipelines.support import interrupt, started_by, tiny
 
 pytestmark = [pytest.mark.ray, pytest.mark.xdist_group("ray")]
-POINTS = 30
+POINTS = 16
 STUDY = tiny(points=POINTS, concurrent=1)
-
-
-def run_here(home: Path) -> int:
-    """Launch the study in this process, without Ray."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ray_driver, "ray_session", lambda *args: nullcontext([]))
-        patch.setattr(ray_driver, "fit", fit_here)
-        return run_studies([STUDY], home)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +35,7 @@ def uninterrupted(tmp_path_factory: pytest.TempPathFactory, template: Path) -> b
     """The export of a launch that nobody disturbed."""
     home = tmp_path_factory.mktemp("whole")
     shutil.copy(template, home / "mlflow.db")
-    assert run_here(home) == 0
+    assert launch_here(STUDY, home) == 0
     assert export_study(STUDY, home / "out", home) == 0
     return (home / "out" / "tiny.parquet").read_bytes()
 
@@ -81,10 +72,10 @@ def statuses(home: Path) -> dict[str, str]:
     return {run.ref: run.status for run in tracker.recorded()}
 
 
-def finish(home: Path, expected: bytes, launch: Callable[[Path], int] = run_here) -> None:
+def finish(home: Path, expected: bytes, launch: Callable[[Study, Path], int] = launch_here) -> None:
     """Launch again: the same runs, whole, nothing doubled."""
     before = statuses(home)
-    assert launch(home) == 0
+    assert launch(STUDY, home) == 0
     after = statuses(home)
     assert before.keys() <= after.keys()
     assert list(after.values()) == ["finished", "finished"]
@@ -110,19 +101,21 @@ def test_a_killed_driver(home: Path, uninterrupted: bytes) -> None:
 def test_an_interrupted_launch(
     home: Path, uninterrupted: bytes, cluster: None, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    def launch(home: Path) -> int:
-        return run_studies([STUDY], home)
-
     thread = threading.Thread(target=interrupt, args=(home,))
     thread.start()
-    assert launch(home) == 130
+    assert run_with_ray(STUDY, home) == 130
     thread.join()
     said = "".join(capfd.readouterr())
     assert "interrupted: each run stops at its next point" in said
     assert "Traceback" not in said
     assert set(statuses(home).values()) <= {"interrupted", "finished"}
     assert not list(home.glob("checkpoints/*/*.part"))
-    finish(home, uninterrupted, launch)
+    finish(home, uninterrupted, run_with_ray)
+
+
+def run_with_ray(study: Study, home: Path) -> int:
+    """What `rhmc study run` does, in this process."""
+    return run_studies([study], home)
 
 
 def newest(home: Path) -> int:

@@ -781,8 +781,8 @@ def test_a_killed_and_interrupted_search_ends_as_one_that_was_not(
     home: Path, cluster: None, project: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     resources = "resources: {concurrent: 1, checkpoint_every: 1}\n"
-    text = GOOD.replace("evaluations: 3", "evaluations: 6") + MEDIAN + resources
-    search = load(text, "quick", "trials=2", "steps=1200")
+    text = GOOD.replace("evaluations: 3", "evaluations: 4") + MEDIAN + resources
+    search = load(text, "quick", "trials=2", "steps=800")
     shutil.copy(home / "mlflow.db", project / "template.db")
     with pytest.MonkeyPatch.context() as alone:  # without Ray: a worker takes seconds to start, and changes nothing
         alone.setattr(ray_driver, "ray_session", lambda *args: nullcontext([]))
@@ -834,7 +834,7 @@ def fresh(project: Path, name: str) -> Path:
 
 
 def command(verb: str) -> list[str]:
-    words = ["search", verb, "studies/search_x.yaml", "--set", "trials=2", "--set", "steps=1200"]
+    words = ["search", verb, "studies/search_x.yaml", "--set", "trials=2", "--set", "steps=800"]
     return [sys.executable, "-W", "ignore", "-m", "pipelines.cli", *words]
 
 

@@ -277,6 +277,7 @@ def test_spread_leaves_alone_what_is_apart() -> None:
     assert figures.spread([0.5, 0.5], 0.04, 0, 1) == pytest.approx([0.48, 0.52])
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_a_study_that_is_not_there(tmp_path: Path) -> None:
     out = tmp_path / "out"
     build(write(tmp_path / "runs", study("coverage", {"RHMC": noisy(67), "IQL": noisy(63)})), out, "quick")
@@ -308,6 +309,7 @@ def test_a_failure_half_way_leaves_the_old_report(
     assert content(out) == before
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_a_rebuild_removes_what_is_no_more(little: Path, tmp_path: Path) -> None:
     out = Path(shutil.copytree(little, tmp_path / "out"))
     (out / "runs").mkdir()
@@ -326,6 +328,7 @@ def test_an_unreadable_table_is_an_error_of_its_own(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_a_study_that_the_paper_does_not_have_gets_its_curves(runs: Path, tmp_path: Path) -> None:
     for part in ("", ".runs"):
         table = pd.read_parquet(runs / f"coverage{part}.parquet").assign(study="reach")
