@@ -18,6 +18,8 @@ SEED ?= 0
 FITS := -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))'
 PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do $$p $(FITS) 2>/dev/null && echo $$p && break; done)
 READY := .venv/.ready
+# A file of tests goes to one process, which makes its fixtures once; `tests/conftest.py` has the order.
+SHARED := --dist loadfile --no-loadscope-reorder
 
 # The environment's own programs first: `rhmc` in a DVC stage is this project's.
 export PATH := $(CURDIR)/.venv/bin:$(PATH)
@@ -41,10 +43,10 @@ repro: $(READY) ## Train, track and report on the profile in params.yaml; an int
 	@echo "MLflow UI: run \`make ui\` and open the address that it prints"
 
 test: check ## Lint, types and every test
-	@python -m pytest -n $(JOBS) --dist loadgroup
+	@python -m pytest -n $(JOBS) $(SHARED)
 
 deep: $(READY) ## Every test, with many more random kills and examples: before a release
-	@DEEP=1 python -m pytest -n $(JOBS) --dist loadgroup
+	@DEEP=1 python -m pytest -n $(JOBS) $(SHARED)
 
 check: $(READY) ## Lint and types only
 	@ruff check --quiet .

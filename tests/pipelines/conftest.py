@@ -22,16 +22,11 @@ KNOWN = [  # warnings of pinned packages about each other
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Let the tests of this folder pass over what is `KNOWN`; every other warning stays an error.
-
-    Those that share Ray go to one of the processes of `pytest -n`, so that it is started once.
-    """
+    """Let the tests of this folder pass over what is `KNOWN`; every other warning stays an error."""
     for item in items:
         if Path(__file__).parent in item.path.parents:
             for warning in KNOWN:
                 item.add_marker(pytest.mark.filterwarnings(warning))
-            if "cluster" in getattr(item, "fixturenames", ()):
-                item.add_marker(pytest.mark.xdist_group("ray"))
 
 
 @pytest.fixture(scope="session")

@@ -37,7 +37,6 @@ from tests.depth import often
 from tests.pipelines.chaos import KILLED, everything, faults, import_in_a_process
 from tests.pipelines.support import CODE, setting, tiny
 
-pytestmark = pytest.mark.xdist_group("bundle")  # its fixtures take seconds to make
 RATES = {"slow": 1e-4, "fast": 1e-2, "late": 1.0, "none": 0.5}
 STUDY = tiny(arms={arm: setting(lr=rate) for arm, rate in RATES.items()})
 DONE = STUDY.model_copy(update={"arms": {arm: STUDY.arms[arm] for arm in ("slow", "fast")}})  # its runs are finished

@@ -42,7 +42,6 @@ from tests.pipelines.fleet import (
 )
 from tests.pipelines.support import CODE, plan, setting, tiny
 
-pytestmark = pytest.mark.xdist_group("cluster")  # its fixtures take seconds to make
 PROGRAMS = postgres_programs()
 needs_postgres = pytest.mark.skipif(
     PROGRAMS is None, reason="PostgreSQL's initdb and postgres are neither on PATH nor in /usr/lib/postgresql"

@@ -18,7 +18,6 @@ from tests.depth import often
 from tests.pipelines.chaos import KILLED, Run, Server, damage, everything, faults, launch, start_launch
 from tests.pipelines.support import setting, tiny
 
-pytestmark = pytest.mark.xdist_group("kills")  # its fixtures take seconds to make
 RATES = {"slow": 1e-4, "fast": 1e-2, "twin": 1e-2}  # the last is copied from the one before
 STUDY = tiny(points=often(8, 20), arms={arm: setting(lr=rate) for arm, rate in RATES.items()})
 KILLS = often(5, 10)

@@ -25,7 +25,7 @@ from pipelines.study import Study
 from tests.pipelines.chaos import WORKER, launch_here
 from tests.pipelines.support import interrupt, started_by, tiny
 
-pytestmark = [pytest.mark.ray, pytest.mark.xdist_group("ray")]
+pytestmark = pytest.mark.ray
 POINTS = 16
 STUDY = tiny(points=POINTS, concurrent=1)
 

@@ -8,7 +8,6 @@ import pytest
 from tests.depth import often
 from tests.pipelines.killed import VERBS, WRONG, Verb, World, disturb, make_world
 
-pytestmark = pytest.mark.xdist_group("kills")  # its fixtures take seconds to make
 KILLS = often(1, 2)
 
 

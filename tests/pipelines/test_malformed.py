@@ -7,7 +7,6 @@ import pytest
 
 from tests.pipelines.malformed import WRONG, Case, Outcome, Runner, cases, judge, look, make_base, prepared
 
-pytestmark = pytest.mark.xdist_group("malformed")  # its fixtures take seconds to make
 SEED = 1
 CASES = cases(SEED)
 KINDS = ("names", "search files", "included files", "paths that are no files", "paper.yaml", "by chance")
