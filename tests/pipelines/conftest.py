@@ -9,6 +9,7 @@ import pytest
 
 os.environ.pop("MLFLOW_TRACKING_URI", None)
 os.environ.pop("RAY_ADDRESS", None)
+os.environ.setdefault("RAY_worker_niceness", "0")  # else whatever else runs, such as other tests, starves them
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -34,7 +34,6 @@ from tests.pipelines import chaos
 from tests.pipelines.chaos import KILLED, Fuse, Run, faults, fit_here, logged, settle, start
 from tests.pipelines.support import setting, tiny
 
-chaos.PRELOAD.extend(["pipelines.bundle", "pipelines.registry", "pipelines.search_plots", "reports.build"])
 STUDY = tiny("killed", 6, {name: setting(lr=1e-2) for name in ("fast", "twin")})  # one is trained and the other copied
 SEARCH = """\
 question: Which?

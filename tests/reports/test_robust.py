@@ -266,7 +266,7 @@ def test_figures_that_cannot_be_drawn_keep_their_places(whole: Path, monkeypatch
 
 
 def test_a_figure_that_cannot_be_saved_leaves_its_numbers(
-    whole: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     drawn = figures.learning_curves
 
@@ -276,8 +276,8 @@ def test_a_figure_that_cannot_be_saved_leaves_its_numbers(
         return drawing
 
     monkeypatch.setattr(figures, "learning_curves", broken)
-    out = whole.parent / "out"
-    assert main(["--runs", str(whole), "--out", str(out)]) == 1
+    out = tmp_path / "out"
+    assert main(["--runs", str(fresh(tmp_path / "runs")), "--out", str(out)]) == 1
     said = capsys.readouterr()
     assert said.err == "curves_reach: could not be drawn (ValueError: no ink)\n"
     assert "start with" in said.out
@@ -287,6 +287,7 @@ def test_a_figure_that_cannot_be_saved_leaves_its_numbers(
 @pytest.mark.parametrize(
     "make", [os.mkfifo, Path.mkdir, lambda p: p.write_text("no"), lambda p: p.write_bytes(b"GIF89a")]
 )
+@pytest.mark.usefixtures("unpainted")
 def test_an_animation_that_is_none_keeps_its_place(make: Plant, tmp_path: Path) -> None:
     make(fresh(tmp_path / "runs") / "episode_x.gif")
     built = build(tmp_path / "runs", tmp_path / "out", "quick")
