@@ -16,11 +16,11 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from reports.escape import markdown
-from reports.frame import ERRORS, FINAL, THEOREM, YARDSTICKS, Results
-from reports.paper import Paper, PaperError
-from reports.stats import FEW, Interval, change, difference, interval
-from reports.tables import NONE, Table, estimate, joined, number, percent, steps
+from reports.data.escaping import markdown
+from reports.data.frame import ERRORS, FINAL, THEOREM, YARDSTICKS, Results
+from reports.data.paper import Paper, PaperError
+from reports.data.stats import FEW, Interval, change, difference, interval
+from reports.render.tables import NONE, Table, estimate, joined, number, percent, steps
 
 Verdict = Literal["reproduced", "partly", "not reproduced", "untestable", "contradicted by the paper itself"]
 VERDICTS: tuple[str, ...] = get_args(Verdict)

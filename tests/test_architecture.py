@@ -13,7 +13,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from ruamel.yaml import YAML
 
-from pipelines.study import Study
+from pipelines.specs.study import Study
 from rhmc.algorithms import ALGORITHMS
 
 ROOT = Path(__file__).parents[1]
@@ -32,37 +32,65 @@ ALLOWED = {
     },
 }
 VERBS = ("common", "doctor", "evaluate", "render", "science", "search", "study", "ui", "verify", "yardsticks")
-# What writes words of users where they are read: these take `reports.escape` and `reports.letters`, and nothing else.
+# What writes words of users where they are read: these take `reports.data.escaping` and `reports.render.glyphs`, and nothing else.
 WRITERS = ("overview", "plan", "search_run", "search_plots")
 # What only these files may import.
 ONLY = {
-    "mlflow": {"pipelines/histories.py", "pipelines/mlflow_tracker.py", "pipelines/registry.py", "pipelines/served.py"},
-    "optuna": {"pipelines/trials.py", "pipelines/search_plots.py"},
-    "sqlalchemy": {
-        *("pipelines/mlflow_tracker.py", "pipelines/moved.py", "pipelines/sqlite.py", "pipelines/trials.py"),
+    "mlflow": {
+        "pipelines/tracking/histories.py",
+        "pipelines/tracking/mlflow_tracker.py",
+        "pipelines/tracking/registry.py",
+        "pipelines/tracking/mlflow_model.py",
     },
-    "matplotlib": {"pipelines/search_plots.py", "pipelines/overview.py"},
+    "optuna": {"pipelines/tuning/trials.py", "pipelines/tuning/search_plots.py"},
+    "sqlalchemy": {
+        *(
+            "pipelines/tracking/mlflow_tracker.py",
+            "pipelines/workspace/relocation.py",
+            "pipelines/workspace/sqlite.py",
+            "pipelines/tuning/trials.py",
+        ),
+    },
+    "matplotlib": {"pipelines/tuning/search_plots.py", "pipelines/tracking/overview.py"},
     "ray": {f"pipelines/{name}.py" for name in ("cluster", "own_node", "ray_driver", "trainable", "pool")},
-    "typer": {"pipelines/cli.py", *(f"pipelines/commands/{name}.py" for name in VERBS)},
+    "typer": {"pipelines/cli/main.py", *(f"pipelines/commands/{name}.py" for name in VERBS)},
     "reports": {
-        "pipelines/commands/science.py",
-        "pipelines/commands/verify.py",
+        "pipelines/cli/science.py",
+        "pipelines/cli/verify.py",
         *(f"pipelines/{name}.py" for name in WRITERS),
     },
 }
 # What these must not import: a physics knows no learner, a regulator neither task nor network.
 BARRED = {
-    "rhmc/envs/": ("rhmc.algorithms", "rhmc.learner", "rhmc.nets", "rhmc.trainer", "rhmc.evaluate"),
-    "rhmc/regulation.py": ("rhmc.envs", "rhmc.algorithms", "rhmc.nets", "rhmc.learner", "rhmc.trainer"),
-    "rhmc/filters.py": ("rhmc.envs", "rhmc.algorithms", "rhmc.nets", "rhmc.learner", "rhmc.trainer"),
-    "rhmc/algorithms/": ("rhmc.trainer", "rhmc.evaluate", "rhmc.scripted"),
+    "rhmc/envs/": (
+        "rhmc.algorithms",
+        "rhmc.learning.learner",
+        "rhmc.networks.nets",
+        "rhmc.training.trainer",
+        "rhmc.training.evaluation",
+    ),
+    "rhmc/hierarchy/regulation.py": (
+        "rhmc.envs",
+        "rhmc.algorithms",
+        "rhmc.networks.nets",
+        "rhmc.learning.learner",
+        "rhmc.training.trainer",
+    ),
+    "rhmc/hierarchy/filters.py": (
+        "rhmc.envs",
+        "rhmc.algorithms",
+        "rhmc.networks.nets",
+        "rhmc.learning.learner",
+        "rhmc.training.trainer",
+    ),
+    "rhmc/algorithms/": ("rhmc.training.trainer", "rhmc.training.evaluation", "rhmc.scripted"),
 }
 # What loading these must not load: help has to answer at once, a check of a study in seconds.
 HEAVY = {"torch", "ray", "mlflow", "numpy", "pandas", "scipy", "matplotlib", "pyarrow", "pydantic"}
 LIGHT = {
-    "pipelines.cli": HEAVY,
-    "pipelines.study": HEAVY - {"torch", "numpy", "pydantic"},
-    "pipelines.search": HEAVY - {"torch", "numpy", "pydantic"} | {"optuna"},
+    "pipelines.cli.main": HEAVY,
+    "pipelines.specs.study": HEAVY - {"torch", "numpy", "pydantic"},
+    "pipelines.specs.search": HEAVY - {"torch", "numpy", "pydantic"} | {"optuna"},
 }
 
 
@@ -156,9 +184,9 @@ def unmatched(what: str, wanted: Iterable[str], listed: Iterable[str]) -> list[s
 def test_what_writes_takes_the_escapes_alone(name: str) -> None:
     source = (ROOT / "pipelines" / f"{name}.py").read_text(encoding="utf-8")
     taken = {i.module for i in imports(f"pipelines/{name}.py", source) if i.top == "reports"}
-    leaves = ("reports.escape", "reports.letters")
+    leaves = ("reports.data.escaping", "reports.render.glyphs")
     assert {module for module in taken if not module.startswith(leaves)} <= {"reports"}
-    assert loaded("reports.escape", modules()) <= {"reports", "re", "hashlib"}
+    assert loaded("reports.data.escaping", modules()) <= {"reports", "re", "hashlib"}
 
 
 @pytest.mark.parametrize("path", files())
@@ -169,21 +197,25 @@ def test_imports_follow_the_arrows(path: str) -> None:
 @pytest.mark.parametrize(
     ("path", "source", "named"),
     [
-        ("rhmc/nets.py", "import numpy", "numpy"),
-        ("rhmc/nets.py", "import torch, pandas as pd", "pandas"),
-        ("rhmc/trainer.py", "def f():\n    from pipelines import study", "pipelines"),
-        ("rhmc/trainer.py", "from importlib import import_module\nimport_module('mlflow')", "mlflow"),
+        ("rhmc/networks/nets.py", "import numpy", "numpy"),
+        ("rhmc/networks/nets.py", "import torch, pandas as pd", "pandas"),
+        ("rhmc/training/trainer.py", "def f():\n    from pipelines import study", "pipelines"),
+        ("rhmc/training/trainer.py", "from importlib import import_module\nimport_module('mlflow')", "mlflow"),
         ("rhmc/envs/coverage.py", "from rhmc.algorithms import ALGORITHMS", "rhmc.algorithms"),
-        ("rhmc/envs/coverage.py", "from rhmc import trainer", "rhmc.trainer"),
-        ("rhmc/envs/coverage.py", "from ..nets import mlp", "rhmc.nets"),
-        ("rhmc/regulation.py", "import rhmc.envs.coverage", "rhmc.envs"),
-        ("reports/figures.py", "from rhmc.types import Frozen", "rhmc"),
-        ("reports/build.py", "try:\n    import pipelines.export\nexcept ImportError:\n    pass", "pipelines"),
-        ("reports/frame.py", "import torch", "torch"),
-        ("reports/frame.py", "from mlflow import MlflowClient", "mlflow"),
-        ("pipelines/run.py", "def f():\n    import mlflow", "mlflow"),
-        ("pipelines/study.py", "from ray import tune", "ray"),
-        ("pipelines/export.py", "import reports.build", "reports"),
+        ("rhmc/envs/coverage.py", "from rhmc import trainer", "rhmc.training.trainer"),
+        ("rhmc/envs/coverage.py", "from ..nets import mlp", "rhmc.networks.nets"),
+        ("rhmc/hierarchy/regulation.py", "import rhmc.envs.coverage", "rhmc.envs"),
+        ("reports/render/figures.py", "from rhmc.types import Frozen", "rhmc"),
+        (
+            "reports/pages/build.py",
+            "try:\n    import pipelines.export.tables\nexcept ImportError:\n    pass",
+            "pipelines",
+        ),
+        ("reports/data/frame.py", "import torch", "torch"),
+        ("reports/data/frame.py", "from mlflow import MlflowClient", "mlflow"),
+        ("pipelines/execution/run.py", "def f():\n    import mlflow", "mlflow"),
+        ("pipelines/specs/study.py", "from ray import tune", "ray"),
+        ("pipelines/export/tables.py", "import reports.pages.build", "reports"),
     ],
 )
 def test_a_wrong_import_is_found(path: str, source: str, named: str) -> None:
@@ -195,8 +227,8 @@ def test_a_wrong_import_is_found(path: str, source: str, named: str) -> None:
 def test_right_imports_pass() -> None:
     source = "import json\nfrom typing import Any\nimport torch\nfrom rhmc.types import Obs\nfrom .base import Env"
     assert faults("rhmc/envs/coverage.py", source) == []
-    assert faults("pipelines/mlflow_tracker.py", "import mlflow") == []
-    assert faults("pipelines/commands/science.py", "def report():\n    from reports import build") == []
+    assert faults("pipelines/tracking/mlflow_tracker.py", "import mlflow") == []
+    assert faults("pipelines/cli/science.py", "def report():\n    from reports import build") == []
 
 
 @pytest.mark.parametrize("module", LIGHT)
@@ -208,11 +240,16 @@ def test_light_modules_load_nothing_heavy(module: str) -> None:
 
 def test_a_heavy_import_is_found_at_any_depth() -> None:
     study = "class A:\n    try:\n        from pipelines import run\n    finally:\n        pass"
-    sources = {"pipelines.cli": "import typer\nfrom pipelines.study import A", "pipelines.study": study}
+    sources = {
+        "pipelines.cli.main": "import typer\nfrom pipelines.specs.study import A",
+        "pipelines.specs.study": study,
+    }
     lazy = "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import torch\ndef f():\n    import mlflow"
-    assert loaded("pipelines.cli", sources | {"pipelines.run": lazy}) & HEAVY == set()
-    assert loaded("pipelines.cli", sources | {"pipelines.run": lazy + "\nimport ray.tune"}) & HEAVY == {"ray"}
-    assert "torch" in loaded("pipelines.cli", sources | {"pipelines": "import torch"})
+    assert loaded("pipelines.cli.main", sources | {"pipelines.execution.run": lazy}) & HEAVY == set()
+    assert loaded("pipelines.cli.main", sources | {"pipelines.execution.run": lazy + "\nimport ray.tune"}) & HEAVY == {
+        "ray"
+    }
+    assert "torch" in loaded("pipelines.cli.main", sources | {"pipelines": "import torch"})
 
 
 # Tables
@@ -303,7 +340,7 @@ def is_search(path: Path) -> bool:
     return path.stem.startswith("search_")
 
 
-NO_PAGE = {"reports/__init__.py", "reports/verify.py"}  # what no page is made with
+NO_PAGE = {"reports/__init__.py", "reports/analyses/equivalence.py"}  # what no page is made with
 
 
 def test_the_report_depends_on_all_its_modules(stages: dict) -> None:

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from torch import Generator, Tensor, nn
 
 from rhmc.algorithms.coma import COMA, Config, draw, expected
-from rhmc.experience import flat
-from rhmc.learner import taken
+from rhmc.learning.experience import flat
+from rhmc.learning.learner import taken
 from rhmc.types import Batch, Local, Obs, Spec, Transition
 from tests.conformance import assert_same
 

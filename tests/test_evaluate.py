@@ -8,8 +8,8 @@ from torch import Generator, Tensor
 
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import ENVS, Task, coverage, make_env, navigation
-from rhmc.evaluate import CHUNK, Episodes, evaluate
-from rhmc.trainer import Config, Trainer
+from rhmc.training.evaluation import CHUNK, Episodes, evaluate
+from rhmc.training.trainer import Config, Trainer
 from rhmc.types import Obs, Transition
 from tests import toy
 from tests.conformance import assert_same

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Generator, Tensor
 
-from rhmc.experience import Experience, Rollout, ends, flat, values
-from rhmc.settings import OffPolicy
+from rhmc.learning.experience import Experience, Rollout, ends, flat, values
+from rhmc.learning.settings import OffPolicy
 from rhmc.types import Batch, Local, Obs, Transition
 from tests.conformance import assert_same
 

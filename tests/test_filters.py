@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from rhmc.filters import FILTERS
+from rhmc.hierarchy.filters import FILTERS
 
 
 @pytest.fixture

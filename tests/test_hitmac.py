@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from torch import Generator, Tensor, nn
 
 from rhmc.algorithms.hitmac import PRACTISED, Config, Decisions, HiTMAC, practice
-from rhmc.attention import Assigner, Contributions, likelihood, orders
 from rhmc.envs import coverage, make_env
 from rhmc.envs.base import Env
-from rhmc.learner import pack
-from rhmc.nets import Sizes
-from rhmc.trainer import Config as Budget
-from rhmc.trainer import Trainer
+from rhmc.hierarchy.attention import Assigner, Contributions, likelihood, orders
+from rhmc.learning.learner import pack
+from rhmc.networks.nets import Sizes
+from rhmc.training.trainer import Config as Budget
+from rhmc.training.trainer import Trainer
 from rhmc.types import Batch, Local, Obs, Spec, Transition
 from tests.conformance import DifferentError, assert_same
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Generator, Tensor, nn
 
-from rhmc.learner import Learner, Replay, pack, unpack
+from rhmc.learning.learner import Learner, Replay, pack, unpack
 from rhmc.types import Obs
 from tests.conformance import assert_same
 

@@ -9,14 +9,14 @@ import torch
 from torch import Generator, Tensor, nn
 
 from rhmc.algorithms.rhmc import RHMC, Config
-from rhmc.coordinator import Coordinator, differences, worth
 from rhmc.envs import coverage, make_env, navigation
 from rhmc.envs.base import Env
-from rhmc.executor import Executor
-from rhmc.learner import Learner, pack
-from rhmc.nets import ENCODERS, PairNet, Sizes, append
-from rhmc.regulation import REGULATORS
-from rhmc.standardise import KEPT
+from rhmc.hierarchy.coordinator import Coordinator, differences, worth
+from rhmc.hierarchy.executor import Executor
+from rhmc.hierarchy.regulation import REGULATORS
+from rhmc.learning.learner import Learner, pack
+from rhmc.learning.normalisation import KEPT
+from rhmc.networks.nets import ENCODERS, PairNet, Sizes, append
 from rhmc.types import Batch, Obs, Spec, Transition, assigned_reward
 from tests.oracles import regulation as oracle
 

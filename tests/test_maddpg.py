@@ -10,11 +10,11 @@ from torch import Generator, Size, Tensor, nn
 from rhmc.algorithms.maddpg import MADDPG, Config
 from rhmc.envs import make_env, navigation
 from rhmc.envs.base import Env
-from rhmc.heads import Choices, Continuous, Discrete
-from rhmc.learner import pack
-from rhmc.sampling import gumbel, straight_through
-from rhmc.trainer import Config as Run
-from rhmc.trainer import Trainer
+from rhmc.learning.learner import pack
+from rhmc.networks.heads import Choices, Continuous, Discrete
+from rhmc.networks.sampling import gumbel, straight_through
+from rhmc.training.trainer import Config as Run
+from rhmc.training.trainer import Trainer
 from rhmc.types import Batch, Obs, Spec
 from tests.conformance import assert_same
 

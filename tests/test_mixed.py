@@ -9,8 +9,8 @@ from torch import Generator, Tensor, nn
 
 from rhmc.algorithms.rhmc import Config
 from rhmc.envs import coverage, make_env
-from rhmc.learner import pack
-from rhmc.mixed import MixedExecutor
+from rhmc.hierarchy.mixing_executor import MixedExecutor
+from rhmc.learning.learner import pack
 from rhmc.types import Batch, Obs, Spec, Transition
 from tests.doubles import Known
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from rhmc.envs import coverage, make_env, navigation
-from rhmc.nets import ENCODERS, Sizes, append, mlp
+from rhmc.networks.nets import ENCODERS, Sizes, append, mlp
 from rhmc.types import Obs
 
 HIDDEN, OUT = 8, 3

@@ -10,10 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Generator, Tensor, nn
 
-from rhmc import ppo
-from rhmc.algorithms import ALGORITHMS
-from rhmc.nets import ENCODERS, Sizes, Unshared
-from rhmc.ppo import PPO, Clip, Config, Penalty
+from rhmc.algorithms import ALGORITHMS, ppo
+from rhmc.algorithms.ppo import PPO, Clip, Config, Penalty
+from rhmc.networks.nets import ENCODERS, Sizes, Unshared
 from rhmc.types import Local, Obs, Spec, Transition
 
 SPEC = Spec(2, 3, agent_features=1, pair_features=2, peer_features=1, actions=3, continuous=False, episode=9)

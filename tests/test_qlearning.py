@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from torch import Generator, Tensor, nn
 
 from rhmc.algorithms import ALGORITHMS
-from rhmc.learner import pack
-from rhmc.nets import ENCODERS, Sizes, Unshared, mix, team
-from rhmc.qlearning import QLearning
-from rhmc.schedules import linear
+from rhmc.algorithms.qlearning import QLearning
+from rhmc.learning.learner import pack
+from rhmc.learning.schedules import linear
+from rhmc.networks.nets import ENCODERS, Sizes, Unshared, mix, team
 from rhmc.types import Batch, Obs, Spec
 from tests.doubles import Known
 

@@ -10,8 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from rhmc.regulation import MOST_TARGETS, REGULATORS, algorithm1_path, executed, high_level_reward, optimal_path
-from rhmc.theorem import CROWDED, random_instances, shortfall_table, smallest_counterexample, summary
+from rhmc.hierarchy.regulation import (
+    MOST_TARGETS,
+    REGULATORS,
+    algorithm1_path,
+    executed,
+    high_level_reward,
+    optimal_path,
+)
+from rhmc.hierarchy.theorem import CROWDED, random_instances, shortfall_table, smallest_counterexample, summary
 from tests.oracles import regulation as oracle
 
 B = 5  # instances per drawn shape

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from rhmc.returns import gae, n_step, td_lambda
+from rhmc.learning.returns import gae, n_step, td_lambda
 
 GOING, CUT, OVER = range(3)  # what comes after a row: the next one, another episode, nothing
 

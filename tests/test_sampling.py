@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Generator, Size
 
-from rhmc.sampling import bernoulli, gumbel, mix, relaxed_bernoulli
+from rhmc.networks.sampling import bernoulli, gumbel, mix, relaxed_bernoulli
 
 DRAWS = 40_000
 FIVE_ERRORS = 5 * 0.5 / DRAWS**0.5  # five standard errors of a frequency, at most

@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
-from rhmc import yardsticks as module
 from rhmc.envs import coverage, make_env, navigation
 from rhmc.scripted import BOUNDS, SCRIPTED, joint
 from rhmc.scripted import coverage as sensors
 from rhmc.scripted import navigation as steering
-from rhmc.yardsticks import yardsticks
+from rhmc.scripted import yardsticks as module
+from rhmc.scripted.yardsticks import yardsticks
 from tests.oracles import coverage as oracle
 
 quick = settings(deadline=None, max_examples=25)

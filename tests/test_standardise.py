@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from rhmc.standardise import KEPT, LEAST, Standard
+from rhmc.learning.normalisation import KEPT, LEAST, Standard
 from tests.conformance import assert_same
 
 CPU = torch.device("cpu")

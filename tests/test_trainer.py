@@ -13,8 +13,8 @@ from rhmc.algorithms import ALGORITHMS
 from rhmc.algorithms import rhmc as rhmc_page
 from rhmc.algorithms.base import Method
 from rhmc.envs import ENVS, Task
-from rhmc.learner import Learner, Learners
-from rhmc.trainer import Config, Means, Trainer, grid_step
+from rhmc.learning.learner import Learner, Learners
+from rhmc.training.trainer import Config, Means, Trainer, grid_step
 from rhmc.types import Frozen, Metrics, Obs, Spec, Transition
 from tests import toy
 from tests.conformance import assert_same

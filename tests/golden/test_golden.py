@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from pipelines.arithmetic import PUBLISHED, differing, operations
+from pipelines.execution.arithmetic import PUBLISHED, differing, operations
 from rhmc.portable import SETTINGS, active
 from tests.golden import cases, kept
 
@@ -34,11 +34,11 @@ def test_operations_give_the_published_bytes() -> None:
 # Ways into the program: each has to settle the arithmetic before anything is computed.
 WAYS = {
     "torch first": "import torch\nimport rhmc",
-    "the science": "from rhmc.trainer import Trainer",
-    "studies": "from pipelines.study import Study",
-    "a worker": "from pipelines.trainable import RunTrainable",
-    "a model of MLflow": "from pipelines.served import ServedPolicy",
-    "command line": "import pipelines.cli\nfrom pipelines.evaluation import score",
+    "the science": "from rhmc.training.trainer import Trainer",
+    "studies": "from pipelines.specs.study import Study",
+    "a worker": "from pipelines.execution.trainable import RunTrainable",
+    "a model of MLflow": "from pipelines.tracking.mlflow_model import ServedPolicy",
+    "command line": "import pipelines.cli.main\nfrom pipelines.policies.evaluation import score",
     "benchmark": "import sys\nsys.path.insert(0, 'benchmarks')\nimport train_speed",
     "golden": "import tests.golden",
 }
@@ -47,7 +47,7 @@ WAYS = {
 @pytest.mark.parametrize("way", WAYS)
 def test_the_arithmetic_is_settled_however_one_comes_in(way: str) -> None:
     """Also where somebody has set something else before."""
-    program = f"{WAYS[way]}\nfrom pipelines.arithmetic import operations\nprint(operations())"
+    program = f"{WAYS[way]}\nfrom pipelines.execution.arithmetic import operations\nprint(operations())"
     hostile = dict.fromkeys(SETTINGS, "default") | {"MKL_CBWR": "COMPATIBLE", "PATH": "/usr/bin:/bin"}
     said = subprocess.run([sys.executable, "-c", program], env=hostile, capture_output=True, text=True, check=True)
     assert said.stdout.strip().splitlines()[-1] == str(PUBLISHED)

@@ -30,17 +30,17 @@ from sqlalchemy import event
 from sqlalchemy.engine import Engine
 from werkzeug.serving import WSGIRequestHandler, make_server
 
-from pipelines import ray_driver, run
-from pipelines.bundle import unpack
-from pipelines.errors import InputError
-from pipelines.mlflow_tracker import open_existing
-from pipelines.names import full
-from pipelines.plan import study_card
-from pipelines.recorders import Recorders
-from pipelines.store import Home
-from pipelines.study import Study
-from pipelines.tracker import StudyCard
-from pipelines.trainable import RunTrainable
+from pipelines.bundles.bundle import unpack
+from pipelines.execution import ray_driver, run
+from pipelines.execution.joint_recorder import Recorders
+from pipelines.execution.trainable import RunTrainable
+from pipelines.specs.safe_names import full
+from pipelines.specs.study import Study
+from pipelines.tracking.mlflow_tracker import open_existing
+from pipelines.tracking.plan import study_card
+from pipelines.tracking.tracker import StudyCard
+from pipelines.workspace.errors import InputError
+from pipelines.workspace.work_folder import Home
 
 ray.tune.trainable.trainable.DEFAULT_STORAGE_PATH = tempfile.gettempdir() + "/ray_results"  # not in a tester's home
 PRELOAD = ["mlflow.server", "mlflow.store.tracking.sqlalchemy_store"]

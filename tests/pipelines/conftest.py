@@ -32,8 +32,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(scope="session")
 def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A fresh MLflow database: making one takes seconds, copying one does not."""
-    from pipelines.mlflow_tracker import create_database
-    from pipelines.store import Home
+    from pipelines.tracking.mlflow_tracker import create_database
+    from pipelines.workspace.work_folder import Home
 
     home = Home(tmp_path_factory.mktemp("template"))
     create_database(home.database)
@@ -50,10 +50,10 @@ def home(tmp_path: Path, template: Path) -> Path:
 @pytest.fixture(scope="session")
 def cluster() -> Iterator[None]:
     """Ray with two processors, shared by the tests of one process."""
-    from pipelines.ray_settings import RAY_SETTINGS
+    from pipelines.execution.ray_settings import RAY_SETTINGS
 
     os.environ.update(RAY_SETTINGS)
-    from pipelines.ray_driver import ray_session
+    from pipelines.execution.ray_driver import ray_session
 
     with ray_session(2):
         yield

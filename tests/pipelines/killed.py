@@ -24,17 +24,24 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
-from pipelines import bundle, export, mlflow_tracker, pool, ray_driver, registry, run, search_run, trials
-from pipelines.plan import Commit, study_card
-from pipelines.pool import Failed, TrialJob, Worker
-from pipelines.search import Search
-from pipelines.tracker import StudyCard
-from reports import build
+from pipelines.bundles import bundle
+from pipelines.execution import ray_driver, run
+from pipelines.export.tables import tables as export
+from pipelines.specs.search import Search
+from pipelines.tracking import mlflow_tracker, registry
+from pipelines.tracking.plan import Commit, study_card
+from pipelines.tracking.tracker import StudyCard
+from pipelines.tuning import ray_workers as pool
+from pipelines.tuning import search_run, trials
+from pipelines.tuning.ray_workers import Failed, TrialJob, Worker
+from reports.pages import build
 from tests.pipelines import chaos
 from tests.pipelines.chaos import KILLED, Fuse, Run, faults, fit_here, logged, settle, start
 from tests.pipelines.support import setting, tiny
 
-chaos.PRELOAD.extend(["pipelines.bundle", "pipelines.registry", "pipelines.search_plots", "reports.build"])
+chaos.PRELOAD.extend(
+    ["pipelines.bundles.bundle", "pipelines.tracking.registry", "pipelines.tuning.search_plots", "reports.pages.build"]
+)
 STUDY = tiny("killed", 6, {name: setting(lr=1e-2) for name in ("fast", "twin")})  # one is trained and the other copied
 SEARCH = """\
 question: Which?

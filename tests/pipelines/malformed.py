@@ -38,11 +38,13 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipelines import bundle, cli, export
-from pipelines.mlflow_tracker import MlflowTracker, create_database
-from pipelines.plan import items, study_card
-from pipelines.policy import Saved, save
-from pipelines.store import Home
+from pipelines.bundles import bundle
+from pipelines.cli.main import main as cli
+from pipelines.export.tables import tables as export
+from pipelines.tracking.mlflow_tracker import MlflowTracker, create_database
+from pipelines.tracking.plan import items, study_card
+from pipelines.tracking.policy import Saved, save
+from pipelines.workspace.work_folder import Home
 from tests.pipelines.support import setting, tiny
 
 FORKS = multiprocessing.get_context("forkserver")
@@ -642,7 +644,7 @@ def environment(case: Case, folder: Path) -> dict[str, str]:
 
 def run_here(case: Case, folder: Path) -> Outcome:
     """Through the entry point, in this process."""
-    from reports import paper as stated
+    from reports.data import paper as stated
 
     out, err, before = io.StringIO(), io.StringIO(), dict(os.environ)
     argv, defaults, place = sys.argv, stated.read.__defaults__, os.getcwd()
@@ -671,7 +673,7 @@ def run_here(case: Case, folder: Path) -> Outcome:
 
 def run_apart(case: Case, folder: Path) -> Outcome:
     """As the command `rhmc`."""
-    command = [sys.executable, "-m", "pipelines.cli", *case.words]
+    command = [sys.executable, "-m", "pipelines.cli.main", *case.words]
     root = {"PYTHONPATH": str(Path(__file__).parents[2])}
     pipes: dict[str, Any] = {"stdin": subprocess.DEVNULL, "capture_output": True, "timeout": LIMIT}
     try:
@@ -701,7 +703,7 @@ class Runner:
         self.process: Any = None
 
     def __enter__(self) -> "Runner":
-        FORKS.set_forkserver_preload(["pipelines.bundle", "pipelines.search_run", "reports.build"])
+        FORKS.set_forkserver_preload(["pipelines.bundles.bundle", "pipelines.tuning.search_run", "reports.pages.build"])
         return self
 
     def __exit__(self, *exception: object) -> None:

@@ -23,12 +23,12 @@ from tempfile import TemporaryDirectory
 
 import psutil
 
-from pipelines import run
-from pipelines.export import write_tables
-from pipelines.mlflow_tracker import create_database, open_existing
-from pipelines.plan import items, study_card
-from pipelines.store import Home
-from pipelines.study import Study
+from pipelines.execution import run
+from pipelines.export.tables import write_tables
+from pipelines.specs.study import Study
+from pipelines.tracking.mlflow_tracker import create_database, open_existing
+from pipelines.tracking.plan import items, study_card
+from pipelines.workspace.work_folder import Home
 from tests.pipelines.chaos import WORKER, Run, damage, everything, faults, free_port
 from tests.pipelines.support import setting, started_by, tiny
 

@@ -21,8 +21,8 @@ import requests
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipelines import cli
-from pipelines.addresses import HIDDEN, fault, reach_loopback, scrubbed, without_password
+from pipelines.cli.main import main as cli
+from pipelines.workspace.addresses import HIDDEN, fault, reach_loopback, scrubbed, without_password
 from tests.pipelines.chaos import free_port
 from tests.pipelines.fleet import postgres, postgres_programs, wait_for
 from tests.pipelines.support import started_by
@@ -207,13 +207,13 @@ def test_the_password_of_a_store_in_use_is_nowhere(place: Path) -> None:
     with postgres(programs, "mlflow") as server:
         address = server.replace("rhmc@", f"rhmc:{CODED}@") + "/mlflow"
         environment = os.environ | {"MLFLOW_TRACKING_URI": address, "PYTHONWARNINGS": "ignore"}
-        log = "from pipelines.mlflow_tracker import *; from pipelines.store import *\n"
+        log = "from pipelines.tracking.mlflow_tracker import *; from pipelines.workspace.work_folder import *\n"
         log += "MlflowTracker(StudyCard('x', 'quick', ''), Home(work_folder())).close('finished')\n"
         words = [sys.executable, "-c", log]
         made = subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
         assert made.returncode == 0, made.stderr
         port = free_port()
-        command = [sys.executable, "-m", "pipelines.cli", "ui", "--port", str(port)]
+        command = [sys.executable, "-m", "pipelines.cli.main", "ui", "--port", str(port)]
         with (place / "said").open("w") as said:
             process = subprocess.Popen(command, cwd=ROOT, env=environment, stdout=said, stderr=said)
         try:
@@ -293,7 +293,7 @@ def test_the_web_interface_comes_up_behind_a_proxy(place: Path, template: Path) 
     (place / "work").mkdir()
     (place / "work" / "mlflow.db").write_bytes(template.read_bytes())
     port = free_port()
-    words = [sys.executable, "-W", "ignore", "-m", "pipelines.cli", "ui", "--port", str(port)]
+    words = [sys.executable, "-W", "ignore", "-m", "pipelines.cli.main", "ui", "--port", str(port)]
     environment = os.environ | {"http_proxy": "http://127.0.0.1:9", "HTTP_PROXY": "http://127.0.0.1:9"}
     with (place / "said").open("w") as said:
         process = subprocess.Popen(words, cwd=ROOT, env=environment, stdout=said, stderr=said)

@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pytest
 
-from pipelines.adoption import Older, compare, older, prove
-from pipelines.errors import InputError
-from pipelines.plan import Item, items, resolved_yaml, study_card
-from pipelines.study import Study
-from pipelines.tracker import MemoryTracker
-from rhmc.trainer import Trainer
+from pipelines.execution.adoption import Older, compare, older, prove
+from pipelines.specs.study import Study
+from pipelines.tracking.plan import Item, items, resolved_yaml, study_card
+from pipelines.tracking.tracker import MemoryTracker
+from pipelines.workspace.errors import InputError
+from rhmc.training.trainer import Trainer
 from rhmc.types import Metrics
 from tests.pipelines.support import setting, tiny
 
@@ -89,7 +89,7 @@ def test_the_last_bit_of_any_value_refuses_and_is_named(metric: str) -> None:
 
 def test_code_that_gives_other_results_refuses(monkeypatch: pytest.MonkeyPatch) -> None:
     tracker = before(STUDY)
-    monkeypatch.setattr("rhmc.qlearning.linear", lambda start, end, over, step: 0.5)
+    monkeypatch.setattr("rhmc.algorithms.qlearning.linear", lambda start, end, over, step: 0.5)
     assert all(proof.difference for proof in prove(older(items(STUDY), tracker), tracker, 1, None, 1))
 
 

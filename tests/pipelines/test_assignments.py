@@ -7,12 +7,13 @@ import pandas as pd
 import pytest
 import torch
 
-from pipelines import assignments, cli
-from pipelines.assignments import Watch, counts, export_assignments, rows_of, watched
-from pipelines.errors import InputError
-from pipelines.study import Study
-from rhmc.theorem import smallest_counterexample
-from rhmc.trainer import Trainer
+from pipelines.cli.main import main as cli
+from pipelines.policies import assignments
+from pipelines.policies.assignments import Watch, counts, export_assignments, rows_of, watched
+from pipelines.specs.study import Study
+from pipelines.workspace.errors import InputError
+from rhmc.hierarchy.theorem import smallest_counterexample
+from rhmc.training.trainer import Trainer
 from rhmc.types import Local, Obs, Transition
 from tests.pipelines.support import jobs_of, setting, tiny
 
@@ -126,7 +127,7 @@ def test_the_command_writes_the_table(
     jobs: list[str], asked: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["studies/ablation.yaml", "--arm", "full", "--seed", "0", "--out", str(tmp_path / "out"), *jobs]
-    seen = jobs_of("pipelines.assignments", monkeypatch)
+    seen = jobs_of("pipelines.policies.assignments", monkeypatch)
     small = ("steps=512", "trainer.evaluations=1", "trainer.eval_episodes=2", "trainer.final_episodes=2")
     words += [word for one in small for word in ("--set", one)]
     monkeypatch.setattr("sys.argv", ["rhmc", "assignments", *words])

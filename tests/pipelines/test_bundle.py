@@ -20,19 +20,21 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from pipelines import bundle_files, bundle_rows, litter
-from pipelines.bundle import Packed, Taken, pack, unpack
-from pipelines.bundle_rows import grid_size, on_grid
-from pipelines.errors import InputError
-from pipelines.evaluation import of_study
-from pipelines.export import export_study
-from pipelines.mlflow_tracker import MlflowTracker, open_existing
-from pipelines.plan import items, study_card
-from pipelines.policy import SPEC, load
-from pipelines.store import Checkpoints, Home, StoreError, load_whole, save_atomically, without_replay
-from pipelines.study import RunSpec, Study
-from pipelines.trainable import RunTrainable
-from rhmc.trainer import Config, Trainer, grid_step
+from pipelines.bundles import files as bundle_files
+from pipelines.bundles import rows as bundle_rows
+from pipelines.bundles.bundle import Packed, Taken, pack, unpack
+from pipelines.bundles.rows import grid_size, on_grid
+from pipelines.execution.trainable import RunTrainable
+from pipelines.export.tables import export_study
+from pipelines.policies.evaluation import of_study
+from pipelines.specs.study import RunSpec, Study
+from pipelines.tracking.mlflow_tracker import MlflowTracker, open_existing
+from pipelines.tracking.plan import items, study_card
+from pipelines.tracking.policy import SPEC, load
+from pipelines.workspace import leftovers as litter
+from pipelines.workspace.errors import InputError
+from pipelines.workspace.work_folder import Checkpoints, Home, StoreError, load_whole, save_atomically, without_replay
+from rhmc.training.trainer import Config, Trainer, grid_step
 from tests.pipelines.chaos import KILLED, everything, faults, import_in_a_process
 from tests.pipelines.support import CODE, setting, tiny
 
@@ -179,7 +181,7 @@ def test_a_second_import_adds_nothing_and_keeps_what_got_further(good: Path, the
 
 
 def test_runs_of_other_code_are_said_to_be(good: Path, there: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipelines.bundle.present", lambda: frozenset({"0ther"}))
+    monkeypatch.setattr("pipelines.bundles.bundle.present", lambda: frozenset({"0ther"}))
     assert unpack(good, there).foreign == 3
 
 

@@ -19,13 +19,14 @@ import pandas as pd
 import pytest
 from typer.main import get_command
 
-from pipelines import cli, yardsticks
-from pipelines.commands import ui
-from pipelines.commands.doctor import MARK
-from pipelines.doctor import Finding
-from pipelines.identity import fingerprint
-from pipelines.side_by_side import KILLED
-from rhmc.yardsticks import names
+from pipelines.cli.checks import Finding
+from pipelines.cli.doctor import MARK
+from pipelines.cli.main import main as cli
+from pipelines.cli.main import ui
+from pipelines.export.tables import yardsticks
+from pipelines.specs.identity import fingerprint
+from pipelines.workspace.process_pool import KILLED
+from rhmc.scripted.yardsticks import names
 from tests.pipelines.fleet import wait_for
 from tests.pipelines.support import jobs_of
 
@@ -71,7 +72,7 @@ def rhmc(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureF
 def imported(modules: set[str], words: list[str]) -> list[str]:
     """Lines that the command prints in a fresh process; the last one lists those of `modules` that it imported."""
     end = f"print(sorted({modules} & set(sys.modules)))"
-    code = f"import sys, pipelines.cli as c\ntry: c.main()\nexcept SystemExit: {end}"
+    code = f"import sys, pipelines.cli.main as c\ntry: c.main()\nexcept SystemExit: {end}"
     done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, cwd=ROOT, check=True)
     return done.stdout.splitlines()
 
@@ -130,7 +131,7 @@ def test_the_page_of_the_command_line_names_every_verb() -> None:
 )
 def test_the_shell_completes(line: str, offered: set[str]) -> None:
     words = {"COMP_WORDS": line, "COMP_CWORD": str(line.count(" ")), "_RHMC_COMPLETE": "complete_bash"}
-    command = [sys.executable, "-m", "pipelines.cli"]
+    command = [sys.executable, "-m", "pipelines.cli.main"]
     done = subprocess.run(command, env=os.environ | words, capture_output=True, text=True, cwd=ROOT, check=False)
     assert set(done.stdout.split()) == offered
 
@@ -219,7 +220,7 @@ def test_status_for_scripts(rhmc: Rhmc) -> None:
 def test_every_verb_of_studies_takes_a_variant(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> None:
     Path("studies/x.yaml").write_text(STUDY + "variants: {large: {algo: {hidden: 128}}}\n")
     names: list[str] = []
-    monkeypatch.setattr("pipelines.run.run_studies", lambda studies, home: names.append(studies[0].name) or 0)
+    monkeypatch.setattr("pipelines.execution.run.run_studies", lambda studies, home: names.append(studies[0].name) or 0)
     for place in ("run.show_status", "export.export_study"):
         monkeypatch.setattr(f"pipelines.{place}", lambda study, *a, **k: names.append(study.name) or 0)
     for verb in (["study", "run"], ["study", "status"], ["export"]):
@@ -251,7 +252,7 @@ def test_the_doctor_answers_with_lines_and_an_exit_code(
     rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch, level: str
 ) -> None:
     given = Finding(level, "disk", "text")
-    monkeypatch.setattr("pipelines.doctor.examine", lambda home, *, ray: iter([given] * (2 - ray)))
+    monkeypatch.setattr("pipelines.cli.checks.examine", lambda home, *, ray: iter([given] * (2 - ray)))
     assert rhmc("doctor").code == (level == "fault")
     assert rhmc("doctor", "--no-ray").out.splitlines() == [f"{MARK[level]}  disk: text"] * 2
     assert json.loads(rhmc("doctor", "--json").out) == [{"level": level, "what": "disk", "text": "text"}]
@@ -262,7 +263,7 @@ def test_run_hands_on_the_studies_the_work_folder_and_the_exit_code(
     rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, code: int
 ) -> None:
     calls: list[tuple[Any, ...]] = []
-    monkeypatch.setattr("pipelines.run.run_studies", lambda *given: calls.append(given) or code)
+    monkeypatch.setattr("pipelines.execution.run.run_studies", lambda *given: calls.append(given) or code)
     shutil.copy("studies/x.yaml", "studies/y.yaml")
     words = ["studies/x.yaml", "studies/y.yaml", "--profile", "paper", "--set", "seeds=1"]
     assert rhmc("study", "run", *words).code == code
@@ -301,11 +302,11 @@ def test_studies_that_cannot_run_together(rhmc: Rhmc, tmp_path: Path) -> None:
 
 def test_export_goes_to_the_folder_of_the_profile(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[tuple[Any, ...]] = []
-    monkeypatch.setattr("pipelines.export.export_study", lambda study, out: calls.append((study.name, out)) or 1)
+    monkeypatch.setattr("pipelines.export.tables.export_study", lambda study, out: calls.append((study.name, out)) or 1)
     report = "next:  rhmc report --study studies/x.yaml"
     assert rhmc("export", "studies/x.yaml", "--profile", "paper") == (1, "", f"{report} --profile paper\n")
     assert rhmc("export", "studies/x.yaml", "--out", "there") == (1, "", f"{report} --runs there\n")
-    monkeypatch.setattr("pipelines.export.export_study", lambda study, out: 2)
+    monkeypatch.setattr("pipelines.export.tables.export_study", lambda study, out: 2)
     assert rhmc("export", "studies/x.yaml") == (2, "", "")
     assert calls == [("x", Path("reports/paper/runs")), ("x", Path("there"))]
 
@@ -313,7 +314,7 @@ def test_export_goes_to_the_folder_of_the_profile(rhmc: Rhmc, monkeypatch: pytes
 def test_export_of_several_studies(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copy("studies/x.yaml", "studies/y.yaml")
     codes = {"x": 1, "y": 0}
-    monkeypatch.setattr("pipelines.export.export_study", lambda study, out: codes[study.name])
+    monkeypatch.setattr("pipelines.export.tables.export_study", lambda study, out: codes[study.name])
     words = ["export", "studies/x.yaml", "studies/y.yaml"]
     assert rhmc(*words) == (1, "", "next:  rhmc report\n")
     codes["x"] = 2
@@ -324,7 +325,7 @@ def test_an_interrupt_is_130(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> Non
     def interrupted(*_: Any) -> int:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pipelines.run.run_studies", interrupted)
+    monkeypatch.setattr("pipelines.execution.run.run_studies", interrupted)
     assert rhmc("study", "run", "studies/x.yaml").code == 130
 
 
@@ -332,7 +333,7 @@ def test_an_interrupt_is_130(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> Non
 def test_report_hands_on_its_options(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch, options: list[str]) -> None:
     calls: list[list[str]] = []
     build = SimpleNamespace(main=lambda given, shown: calls.append(given) or 2)
-    monkeypatch.setitem(sys.modules, "reports.build", build)
+    monkeypatch.setitem(sys.modules, "reports.pages.build", build)
     assert rhmc("report", *options).code == 2
     assert calls == [options]
 
@@ -386,7 +387,7 @@ def test_yardsticks_name_the_nearest_policy(rhmc: Rhmc) -> None:
 
 
 def test_yardsticks_are_exported_beside_the_runs(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipelines.yardsticks.fingerprint", lambda: "0" * 12)
+    monkeypatch.setattr("pipelines.export.yardsticks.fingerprint", lambda: "0" * 12)
     first = ["yardsticks", "coverage", "--episodes", "20", "--json", "--out", "o", "--policies", "hold,range_bound"]
     scores = json.loads(rhmc(*first).out)
     rhmc("yardsticks", "navigation", "--episodes", "20", "--out", "o", "--policies", "random")
@@ -406,7 +407,7 @@ def test_an_export_replaces_a_policy_of_the_same_task_and_drops_other_code(
     rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words = ["yardsticks", "navigation", "--out", "o", "--policies"]
-    monkeypatch.setattr("pipelines.yardsticks.fingerprint", lambda: "0" * 12)
+    monkeypatch.setattr("pipelines.export.yardsticks.fingerprint", lambda: "0" * 12)
     rhmc(*words, "random,hold", "--episodes", "20")
     before = Path("o/yardsticks.parquet").read_bytes()
     rhmc(*words, "random,hold", "--episodes", "20")
@@ -414,7 +415,7 @@ def test_an_export_replaces_a_policy_of_the_same_task_and_drops_other_code(
     rhmc(*words, "random", "--episodes", "30")
     runs = pd.read_parquet("o/yardsticks.runs.parquet").set_index("arm")["config"].map(json.loads)
     assert {arm: config["episodes"] for arm, config in runs.items()} == {"random": 30, "hold": 20}
-    monkeypatch.setattr("pipelines.yardsticks.fingerprint", lambda: "1" * 12)
+    monkeypatch.setattr("pipelines.export.yardsticks.fingerprint", lambda: "1" * 12)
     rhmc(*words, "nearest", "--episodes", "20")
     assert list(pd.read_parquet("o/yardsticks.runs.parquet")["arm"]) == ["nearest"]
     assert set(pd.read_parquet("o/yardsticks.parquet")["arm"]) == {"nearest"}
@@ -449,16 +450,16 @@ def test_an_export_without_a_return_is_left_out(rhmc: Rhmc) -> None:
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Banks that take a second: few episodes, and three of the tasks."""
     tasks = [yardsticks.TASKS[n] for n in (1, 5, -1)]
-    monkeypatch.setattr("pipelines.yardsticks.EPISODES", {"quick": yardsticks.Episodes(4, 2)})
-    monkeypatch.setattr("pipelines.yardsticks.TASKS", tuple(tasks))
-    monkeypatch.setattr("pipelines.yardsticks.fingerprint", lambda: "0" * 12)
-    monkeypatch.setattr("pipelines.yardsticks.commit", lambda: "abc")
+    monkeypatch.setattr("pipelines.export.yardsticks.EPISODES", {"quick": yardsticks.Episodes(4, 2)})
+    monkeypatch.setattr("pipelines.export.yardsticks.TASKS", tuple(tasks))
+    monkeypatch.setattr("pipelines.export.yardsticks.fingerprint", lambda: "0" * 12)
+    monkeypatch.setattr("pipelines.export.yardsticks.commit", lambda: "abc")
 
 
 def test_all_yardsticks_are_the_same_whatever_is_played_at_a_time(
     rhmc: Rhmc, small: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seen = jobs_of("pipelines.yardsticks", monkeypatch)
+    seen = jobs_of("pipelines.export.yardsticks", monkeypatch)
     alone = rhmc("yardsticks", "all", "--out", "one", "--jobs", "1")
     several = rhmc("yardsticks", "all", "--out", "two")
     assert seen == [1, 2]
@@ -519,7 +520,7 @@ def test_all_yardsticks_are_all(profile: str, rhmc: Rhmc, monkeypatch: pytest.Mo
         played.append((env, tuple(chosen), episodes, seed))
         return {}
 
-    monkeypatch.setattr("rhmc.yardsticks.yardsticks", play)
+    monkeypatch.setattr("rhmc.scripted.yardsticks.yardsticks", play)
     for words in by_hand(profile):
         assert rhmc("yardsticks", *words).code == 0
     found = yardsticks.banks(profile)
@@ -542,14 +543,14 @@ def test_all_yardsticks_are_all(profile: str, rhmc: Rhmc, monkeypatch: pytest.Mo
 def test_all_yardsticks_are_not_played_for_nothing(
     words: list[str], said: str, rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipelines.yardsticks.score_banks", None)
+    monkeypatch.setattr("pipelines.export.yardsticks.score_banks", None)
     Path("o").mkdir()
     pd.DataFrame({"a": [1]}).to_parquet("o/yardsticks.parquet")
     assert rhmc("yardsticks", "all", *words) == (2, "", said + "\n")
 
 
 def test_a_worker_that_is_killed_writes_nothing(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipelines.yardsticks._play", die)
+    monkeypatch.setattr("pipelines.export.yardsticks._play", die)
     said = rhmc("yardsticks", "all", "--out", "o")
     assert (said.code, said.out, said.err) == (2, "", KILLED + "\n")
     assert not Path("o").exists()
@@ -641,7 +642,9 @@ def test_ui_serves_the_store_on_this_machine_only_until_ctrl_c(
         return now
 
     monkeypatch.setattr("urllib.request.urlopen", answer)
-    monkeypatch.setattr("pipelines.mlflow_tracker.addresses", lambda *given: [("a", "One", "x"), ("a", "Two", "y")])
+    monkeypatch.setattr(
+        "pipelines.tracking.mlflow_tracker.addresses", lambda *given: [("a", "One", "x"), ("a", "Two", "y")]
+    )
     said = rhmc("ui", "--port", str(port))
     assert list(asked) == []  # it waited for the server
     assert said.out.endswith(" ends it)\n\na\n  One:            x\n  Two:            y\n")

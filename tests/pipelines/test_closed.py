@@ -18,10 +18,10 @@ import psutil
 import pytest
 import ray
 
-from pipelines import cli
-from pipelines.cluster import ALIVE, REFUSAL, STATUS, ask
-from pipelines.own_node import AUTH, FILES, INSIDE, LONGEST, allow_files, closed, private_folder
-from pipelines.store import StoreError
+from pipelines.cli.main import main as cli
+from pipelines.execution.cluster import ALIVE, REFUSAL, STATUS, ask
+from pipelines.execution.private_node import AUTH, FILES, INSIDE, LONGEST, allow_files, closed, private_folder
+from pipelines.workspace.work_folder import StoreError
 from tests.pipelines.fleet import ROOT, SETTINGS, program
 
 UNKNOWN = STATUS + b"\x0212"  # gRPC's word for a call that a program does not have
@@ -196,8 +196,10 @@ def test_foreign_drivers_and_nodes_are_refused(session: list[psutil.Process], tm
 
 def test_a_session_is_closed_whatever_was_set_for_a_cluster(monkeypatch: pytest.MonkeyPatch) -> None:
     mine = {"RAY_AUTH_MODE": "disabled", "RAY_AUTH_TOKEN": "mine", "RAY_AUTH_TOKEN_PATH": "/mine"}
-    monkeypatch.setattr("pipelines.own_node.read_again", lambda: None)  # a session of other tests may run
-    monkeypatch.setattr("pipelines.own_node.Config", type("Config", (), {"initialize": lambda text: None}))
+    monkeypatch.setattr("pipelines.execution.private_node.read_again", lambda: None)  # a session of other tests may run
+    monkeypatch.setattr(
+        "pipelines.execution.private_node.Config", type("Config", (), {"initialize": lambda text: None})
+    )
     for name, value in mine.items():
         monkeypatch.setenv(name, value)
     tokens = []

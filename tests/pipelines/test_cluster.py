@@ -14,20 +14,20 @@ from typing import Any, NamedTuple
 import pytest
 from filelock import FileLock
 
-from pipelines import cluster
-from pipelines.bundle import pack
-from pipelines.cluster import DEATHS, NODE_DIED, Deaths, Place, Sight, knock, look, outline, probing, wrong
-from pipelines.export import export_study
-from pipelines.mlflow_tracker import open_existing
-from pipelines.plan import study_card
-from pipelines.ray_driver import Bridge
-from pipelines.run import show_status
-from pipelines.search import Search
-from pipelines.search_run import search_card, show_search
-from pipelines.seeds import Seeds
-from pipelines.store import Home, StoreError
-from pipelines.study import Setting
-from pipelines.trainable import RunTrainable
+from pipelines.bundles.bundle import pack
+from pipelines.execution import cluster
+from pipelines.execution.cluster import DEATHS, NODE_DIED, Deaths, Place, Sight, knock, look, outline, probing, wrong
+from pipelines.execution.ray_driver import Bridge
+from pipelines.execution.run import show_status
+from pipelines.execution.seed_group import Seeds
+from pipelines.execution.trainable import RunTrainable
+from pipelines.export.tables import export_study
+from pipelines.specs.search import Search
+from pipelines.specs.study import Setting
+from pipelines.tracking.mlflow_tracker import open_existing
+from pipelines.tracking.plan import study_card
+from pipelines.tuning.search_run import search_card, show_search
+from pipelines.workspace.work_folder import Home, StoreError
 from rhmc.types import Metrics
 from tests.pipelines.chaos import everything, faults, launch
 from tests.pipelines.fleet import (
@@ -413,7 +413,7 @@ def test_a_search_in_postgresql_is_killed_and_goes_on_with_more_trials(
 ) -> None:
     (tmp_path / "search_x.yaml").write_text(SEARCH)
     monkeypatch.chdir(tmp_path)
-    command = ["pipelines.cli", "search", "run", "search_x.yaml"]
+    command = ["pipelines.cli.main", "search", "run", "search_x.yaml"]
     with driver(command, at_site, tmp_path) as launched:
         wait_for(lambda: launched.said() and list(tmp_path.glob("checkpoints/*/0*.pt")), "a trial under way")
     more = Search.load("search_x.yaml", overrides=["trials=3"])

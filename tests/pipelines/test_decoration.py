@@ -9,17 +9,19 @@ import pytest
 from matplotlib.legend import Legend
 from rich.console import Console
 
-from pipelines import mlflow_tracker, overview, search_run, trainable
-from pipelines.commands import common
-from pipelines.decoration import WHY_NOT, decoration
-from pipelines.overview import Run, so_far, table
-from pipelines.plan import study_card
-from pipelines.progress import LiveBoard, PlainBoard, SafeBoard, print_table
-from pipelines.recorder import Recorder
-from pipelines.store import Home, StoreError
-from pipelines.terminal import terminal
-from pipelines.tracker import MemoryRun, MemoryTracker, StudyCard
-from reports import escape
+from pipelines.cli.main import common
+from pipelines.execution import trainable
+from pipelines.execution.progress import LiveBoard, PlainBoard, SafeBoard, print_table
+from pipelines.execution.recorder import Recorder
+from pipelines.tracking import mlflow_tracker, overview
+from pipelines.tracking.overview import Run, so_far, table
+from pipelines.tracking.plan import study_card
+from pipelines.tracking.tracker import MemoryRun, MemoryTracker, StudyCard
+from pipelines.tuning import search_run
+from pipelines.workspace.best_effort import WHY_NOT, decoration
+from pipelines.workspace.terminal import terminal
+from pipelines.workspace.work_folder import Home, StoreError
+from reports.data import escaping as escape
 from tests.pipelines.support import plan, setting, tiny
 from tests.reports.hostile import NAMES, QUESTION, csv_words, markdown_words
 
@@ -110,12 +112,12 @@ def test_a_policy_that_cannot_be_kept_is_an_error(
 def test_a_training_finishes_without_its_animation_and_without_a_note(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import pipelines.render
+    import pipelines.policies.render
 
     class Folder:
         folder = tmp_path / "gone"
 
-    monkeypatch.setattr(pipelines.render, "episode_gif", fails)
+    monkeypatch.setattr(pipelines.policies.render, "episode_gif", fails)
     bare = object.__new__(trainable.RunTrainable)
     bare.job, bare.checkpoints = {"spec": "{"}, Folder()  # type: ignore[assignment, typeddict-item]
     bare._animate({"algorithm": {}})
@@ -165,7 +167,7 @@ def test_a_colour_and_a_view_that_fail(
 
 
 def test_a_plot_of_a_search_that_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import pipelines.search_plots
+    import pipelines.tuning.search_plots
 
     class Some:
         arm, study = "IQL", None
@@ -178,7 +180,7 @@ def test_a_plot_of_a_search_that_fails(tmp_path: Path, monkeypatch: pytest.Monke
     class Card:
         note = "note"
 
-    monkeypatch.setattr(pipelines.search_plots, "plots", fails)
+    monkeypatch.setattr(pipelines.tuning.search_plots, "plots", fails)
     monkeypatch.setattr(search_run, "search_card", lambda _: Card)
     told: list[str] = []
     card = StudyCard("s", "quick", "", {}, [])

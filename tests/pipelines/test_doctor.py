@@ -8,9 +8,7 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
-from pipelines import doctor
-from pipelines.arithmetic import PUBLISHED
-from pipelines.doctor import (
+from pipelines.cli.checks import (
     Finding,
     arithmetic,
     disk,
@@ -22,9 +20,11 @@ from pipelines.doctor import (
     store,
     torch_build,
 )
-from pipelines.mlflow_tracker import MlflowTracker
-from pipelines.plan import study_card
-from pipelines.store import Home
+from pipelines.cli.main import checks as doctor
+from pipelines.execution.arithmetic import PUBLISHED
+from pipelines.tracking.mlflow_tracker import MlflowTracker
+from pipelines.tracking.plan import study_card
+from pipelines.workspace.work_folder import Home
 from tests.pipelines.support import CODE, plan, tiny
 
 
@@ -86,7 +86,7 @@ def test_a_store_that_is_none_or_not_there(tmp_path: Path) -> None:
 
 
 def test_what_waits_and_what_is_of_other_code(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipelines.identity.code_id", lambda *place: CODE)
+    monkeypatch.setattr("pipelines.specs.identity.code_id", lambda *place: CODE)
     tracker = MlflowTracker(study_card(tiny()), Home(home))
     slow, fast = plan()
     tracker.start(slow.card).finish("interrupted")
@@ -117,8 +117,8 @@ def test_ray_starts(cluster: None) -> None:
 
 @pytest.mark.parametrize("fence", [("192.0.2.1", True), ("127.0.0.1", False)])
 def test_a_ray_that_strangers_reach_is_a_fault(fence: tuple[str, bool], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipelines.ray_driver.ray_session", lambda *args, **kwargs: nullcontext([]))
-    monkeypatch.setattr("pipelines.cluster.fence", lambda: fence)
+    monkeypatch.setattr("pipelines.execution.ray_driver.ray_session", lambda *args, **kwargs: nullcontext([]))
+    monkeypatch.setattr("pipelines.execution.cluster.fence", lambda: fence)
     assert [one.level for one in starts_ray()] == ["fault"]
 
 

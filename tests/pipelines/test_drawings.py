@@ -9,12 +9,12 @@ import torch
 from torch import Tensor, nn
 from typer.testing import CliRunner
 
-from pipelines.cli import app
-from pipelines.drawings import export_drawings
-from pipelines.errors import InputError
-from pipelines.modules import Record, describe_modules, trace
-from pipelines.scenes import describe_scenes
-from pipelines.store import StoreError
+from pipelines.cli.main import app
+from pipelines.export.drawings import export_drawings
+from pipelines.export.network_graph import Record, describe_modules, trace
+from pipelines.export.scenes import describe_scenes
+from pipelines.workspace.errors import InputError
+from pipelines.workspace.work_folder import StoreError
 from tests.oracles import regulation as oracle
 
 

@@ -5,15 +5,15 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.errors import InputError
-from pipelines.evaluation import Bank, Policy, of_file, of_study, score
-from pipelines.mlflow_tracker import MlflowTracker
-from pipelines.plan import items, resolved_yaml, study_card
-from pipelines.policy import Saved, load, save
-from pipelines.store import Checkpoints, Home, save_atomically, without_replay
-from pipelines.study import RunSpec, Study
+from pipelines.policies.evaluation import Bank, Policy, of_file, of_study, score
+from pipelines.specs.study import RunSpec, Study
+from pipelines.tracking.mlflow_tracker import MlflowTracker
+from pipelines.tracking.plan import items, resolved_yaml, study_card
+from pipelines.tracking.policy import Saved, load, save
+from pipelines.workspace.errors import InputError
+from pipelines.workspace.work_folder import Checkpoints, Home, save_atomically, without_replay
 from rhmc.algorithms import ALGORITHMS
-from rhmc.trainer import Trainer
+from rhmc.training.trainer import Trainer
 from rhmc.types import Metrics
 from tests.pipelines.support import setting, spec, tiny
 

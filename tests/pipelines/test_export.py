@@ -6,12 +6,12 @@ import pandas as pd
 import pytest
 import torch
 
-from pipelines.export import EXPORTED, METRICS, export_study, write_tables
-from pipelines.host import Host, host
-from pipelines.plan import Item, items, study_card
-from pipelines.store import StoreError
-from pipelines.study import RunSpec
-from pipelines.tracker import MemoryRun, MemoryTracker
+from pipelines.export.tables import EXPORTED, METRICS, export_study, write_tables
+from pipelines.specs.study import RunSpec
+from pipelines.tracking.plan import Item, items, study_card
+from pipelines.tracking.tracker import MemoryRun, MemoryTracker
+from pipelines.workspace.provenance import Host, host
+from pipelines.workspace.work_folder import StoreError
 from tests.pipelines.support import CODE, plan, tiny
 
 POINTS = [

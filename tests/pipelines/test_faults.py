@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from mlflow import MlflowClient
 
-from pipelines.export import export_study
+from pipelines.export.tables import export_study
 from tests.pipelines.chaos import KILLED, Run, Server, damage, everything, faults, launch, start_launch
 from tests.pipelines.support import setting, tiny
 

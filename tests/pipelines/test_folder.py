@@ -15,19 +15,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sqlalchemy import create_engine, make_url
 
-from pipelines import moved, run, sqlite
-from pipelines.bundle import pack, unpack
-from pipelines.errors import InputError
-from pipelines.evaluation import of_study
-from pipelines.export import export_study
-from pipelines.mlflow_tracker import MlflowTracker, fetch, open_existing, prepared
-from pipelines.plan import items, study_card
-from pipelines.policy import FILE, Saved, load, save
-from pipelines.search import Search
-from pipelines.search_run import show_search
-from pipelines.store import Home, StoreError, work_folder
-from pipelines.trials import Ledger, look, open_storage, opened
-from rhmc.trainer import Trainer, grid_step
+from pipelines.bundles.bundle import pack, unpack
+from pipelines.execution import run
+from pipelines.export.tables import export_study
+from pipelines.policies.evaluation import of_study
+from pipelines.specs.search import Search
+from pipelines.tracking.mlflow_tracker import MlflowTracker, fetch, open_existing, prepared
+from pipelines.tracking.plan import items, study_card
+from pipelines.tracking.policy import FILE, Saved, load, save
+from pipelines.tuning.search_run import show_search
+from pipelines.tuning.trials import Ledger, look, open_storage, opened
+from pipelines.workspace import relocation as moved
+from pipelines.workspace import sqlite
+from pipelines.workspace.errors import InputError
+from pipelines.workspace.work_folder import Home, StoreError, work_folder
+from rhmc.training.trainer import Trainer, grid_step
 from tests.pipelines.support import setting, tiny
 
 HOSTILE = "#x ?y %2F z'\"~{a}\n"
@@ -409,7 +411,7 @@ def test_looking_at_a_search_makes_no_study_in_it(old: Path, monkeypatch: pytest
     assert storage is not None
     assert look(search, "one", storage)[0].counts()["running"] == 1
     before = (old / "optuna.db").read_bytes()
-    monkeypatch.setattr("pipelines.search.code_id", lambda *place: "0ther")
+    monkeypatch.setattr("pipelines.specs.search.code_id", lambda *place: "0ther")
     assert look(search, "one", storage)[1] == 1
     assert (old / "optuna.db").read_bytes() == before
 

@@ -13,13 +13,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic.fields import FieldInfo
 
-from pipelines import identity
-from pipelines.identity import TRAINER, code_id, combined, fingerprint, folder_of, modules
-from pipelines.study import TABLES, RunSpec
-from pipelines.syntax import Code
+from pipelines.specs import identity
+from pipelines.specs.identity import TRAINER, code_id, combined, fingerprint, folder_of, modules
+from pipelines.specs.study import TABLES, RunSpec
+from pipelines.specs.syntax import Code
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import ENVS
-from rhmc.trainer import Config as TrainerConfig
+from rhmc.training.trainer import Config as TrainerConfig
 
 ROOT = Path(__file__).parents[2]
 PLACES = [(method, task) for method in ALGORITHMS for task in ENVS]
@@ -200,9 +200,17 @@ def test_every_python_names_the_code_alike() -> None:
 
 def test_the_code_of_a_run_is_its_method_its_task_and_the_trainer() -> None:
     found = modules("qmix", "coverage")
-    assert {TRAINER, "rhmc.algorithms.qmix", "rhmc.qlearning", "rhmc.envs.coverage", "rhmc.portable"} <= set(found)
+    assert {TRAINER, "rhmc.algorithms.qmix", "rhmc.algorithms.qlearning", "rhmc.envs.coverage", "rhmc.portable"} <= set(
+        found
+    )
     others = {f"rhmc.algorithms.{kind}" for kind in ALGORITHMS if kind != "qmix"}
-    assert not {*others, "rhmc.envs.navigation", "rhmc.ppo", "rhmc.executor", "rhmc.yardsticks"} & set(found)
+    assert not {
+        *others,
+        "rhmc.envs.navigation",
+        "rhmc.algorithms.ppo",
+        "rhmc.hierarchy.executor",
+        "rhmc.scripted.yardsticks",
+    } & set(found)
     assert len({code_id(*place) for place in PLACES}) == len(PLACES)
 
 
@@ -291,7 +299,9 @@ def test_a_module_in_another_folder_ages_no_run(tmp_path: Path, monkeypatch: pyt
     (folder / "learning" / "__init__.py").write_text('"""How methods learn."""\n')
     (folder / "learner.py").rename(folder / "learning" / "learner.py")
     for file in folder.rglob("*.py"):
-        file.write_text(file.read_text().replace("from rhmc.learner import", "from rhmc.learning.learner import"))
+        file.write_text(
+            file.read_text().replace("from rhmc.learning.learner import", "from rhmc.learning.learner import")
+        )
     assert names(monkeypatch) == before
     assert "rhmc.learning.learner" in modules("qmix", "coverage")
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.study import Study, StudyError, changes
+from pipelines.specs.study import Study, StudyError, changes
 
 GOOD = """\
 question: Which?

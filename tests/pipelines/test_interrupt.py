@@ -13,11 +13,11 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.export import export_study
-from pipelines.mlflow_tracker import open_existing
-from pipelines.plan import study_card
-from pipelines.run import run_studies
-from pipelines.store import Home
+from pipelines.execution.run import run_studies
+from pipelines.export.tables import export_study
+from pipelines.tracking.mlflow_tracker import open_existing
+from pipelines.tracking.plan import study_card
+from pipelines.workspace.work_folder import Home
 from tests.pipelines.chaos import WORKER
 from tests.pipelines.support import started_by, tiny
 

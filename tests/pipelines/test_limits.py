@@ -8,18 +8,18 @@ from pydantic import BaseModel
 from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
-from pipelines import limits
-from pipelines.budget import shortfall, starts
-from pipelines.cli import app
-from pipelines.document import Node, Place, validate
-from pipelines.errors import InputError
-from pipelines.run import run_studies
-from pipelines.search import Dimension, Pruner, Sampler, Search
-from pipelines.study import PROFILES, TABLES, Counts, Resources, SeedCounts, Setting, Study, StudyError
-from rhmc import trainer
+from pipelines.cli.main import app
+from pipelines.execution.run import run_studies
+from pipelines.specs import limits
+from pipelines.specs.document import Node, Place, validate
+from pipelines.specs.learning_start import shortfall, starts
+from pipelines.specs.search import Dimension, Pruner, Sampler, Search
+from pipelines.specs.study import PROFILES, TABLES, Counts, Resources, SeedCounts, Setting, Study, StudyError
+from pipelines.workspace.errors import InputError
 from rhmc.algorithms import ALGORITHMS
-from rhmc.learner import Learner
-from rhmc.trainer import Trainer
+from rhmc.learning.learner import Learner
+from rhmc.training import trainer
+from rhmc.training.trainer import Trainer
 from tests.pipelines.support import setting, tiny
 
 ROOT = Path(__file__).parents[2]

@@ -10,10 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from pipelines import litter, trials
-from pipelines.litter import HOST, claim, dead, part_of, scratch, sweep_claimed, sweep_scratch
-from pipelines.mlflow_tracker import create_database
-from pipelines.store import Home, StoreError, whole
+from pipelines.tracking.mlflow_tracker import create_database
+from pipelines.tuning import trials
+from pipelines.workspace import leftovers as litter
+from pipelines.workspace.leftovers import HOST, claim, dead, part_of, scratch, sweep_claimed, sweep_scratch
+from pipelines.workspace.work_folder import Home, StoreError, whole
 
 WAITS = "import sys; print('ready', flush=True); sys.stdin.read()"
 
@@ -93,9 +94,7 @@ def test_scratch_of_the_dead_is_swept_once(temporary: Path, living: int, gone: i
 
 
 def test_a_process_killed_in_its_scratch_leaves_it_to_the_next(temporary: Path) -> None:
-    code = (
-        "from pipelines.litter import scratch\nwith scratch() as f:\n (f / 'x').touch()\n print(f, flush=True); input()"
-    )
+    code = "from pipelines.workspace.leftovers import scratch\nwith scratch() as f:\n (f / 'x').touch()\n print(f, flush=True); input()"
     environment = os.environ | {"TMPDIR": str(temporary)}
     command, pipes = [sys.executable, "-c", code], {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     with subprocess.Popen(command, env=environment, encoding="utf-8", **pipes) as process:  # type: ignore[call-overload]

@@ -10,13 +10,13 @@ import torch
 from torch import Generator, nn
 from typer.testing import CliRunner
 
-from pipelines.cli import app
-from pipelines.errors import InputError
-from pipelines.methods import TASKS, count, describe, export_methods
-from pipelines.store import StoreError
+from pipelines.cli.main import app
+from pipelines.export.methods import TASKS, count, describe, export_methods
+from pipelines.workspace.errors import InputError
+from pipelines.workspace.work_folder import StoreError
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import make_env
-from rhmc.nets import ENCODERS, Sizes
+from rhmc.networks.nets import ENCODERS, Sizes
 
 
 def size(*layers: tuple[int, int]) -> int:

@@ -20,17 +20,17 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
-from pipelines import cli
-from pipelines.errors import LONGEST, MOST, InputError, visible
-from pipelines.found import file_name, stem
-from pipelines.names import PROFILES, RESERVED, STUDY, folded, slug
-from pipelines.origin import another, remember
-from pipelines.plan import chosen
-from pipelines.registry import model_name
-from pipelines.search import Search
-from pipelines.store import Home
-from pipelines.study import Study, StudyError
-from pipelines.tracker import StudyCard
+from pipelines.cli.main import main as cli
+from pipelines.specs.safe_names import PROFILES, RESERVED, STUDY, folded, slug
+from pipelines.specs.search import Search
+from pipelines.specs.source_file import another, remember
+from pipelines.specs.study import Study, StudyError
+from pipelines.tracking.plan import chosen
+from pipelines.tracking.registry import model_name
+from pipelines.tracking.tracker import StudyCard
+from pipelines.tuning.best_params import file_name, stem
+from pipelines.workspace.errors import LONGEST, MOST, InputError, visible
+from pipelines.workspace.work_folder import Home
 from tests.pipelines.support import tiny
 
 ROOT = Path(__file__).parents[2]

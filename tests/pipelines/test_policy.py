@@ -10,17 +10,17 @@ import pytest
 import torch
 from torch import Generator, Tensor
 
-from pipelines import policy
-from pipelines.errors import InputError
-from pipelines.mlflow_tracker import MlflowTracker
-from pipelines.plan import resolved_yaml, study_card
-from pipelines.policy import Actor, Saved
-from pipelines.store import Home, StoreError, save_atomically, without_replay
-from pipelines.study import RunSpec
-from pipelines.tracker import Card, StudyCard
+from pipelines.specs.study import RunSpec
+from pipelines.tracking import policy
+from pipelines.tracking.mlflow_tracker import MlflowTracker
+from pipelines.tracking.plan import resolved_yaml, study_card
+from pipelines.tracking.policy import Actor, Saved
+from pipelines.tracking.tracker import Card, StudyCard
+from pipelines.workspace.errors import InputError
+from pipelines.workspace.work_folder import Home, StoreError, save_atomically, without_replay
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import make_env
-from rhmc.trainer import Trainer
+from rhmc.training.trainer import Trainer
 from rhmc.types import Obs
 from tests.pipelines.support import plan, spec, tiny
 

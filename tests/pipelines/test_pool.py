@@ -8,11 +8,11 @@ import pytest
 import ray
 from ray.exceptions import ActorDiedError
 
-from pipelines import cluster as nodes
-from pipelines import pool as module
-from pipelines.cluster import DEATHS, NODE_DIED, Place
-from pipelines.pool import Failed, Pool, Taken, TrialJob
-from pipelines.seeds import Seeds
+from pipelines.execution import cluster as nodes
+from pipelines.execution.cluster import DEATHS, NODE_DIED, Place
+from pipelines.execution.seed_group import Seeds
+from pipelines.tuning import ray_workers as module
+from pipelines.tuning.ray_workers import Failed, Pool, Taken, TrialJob
 from rhmc.types import Metrics
 from tests.pipelines.support import tiny
 

@@ -7,15 +7,15 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
-from pipelines.cli import app
-from pipelines.errors import InputError
-from pipelines.export import write_tables
-from pipelines.plan import items, study_card
-from pipelines.published import folder, publish, retrain
-from pipelines.study import Study
-from pipelines.tracker import MemoryTracker
-from reports.verify import read
-from rhmc.trainer import Trainer
+from pipelines.cli.main import app
+from pipelines.export.published import folder, publish, retrain
+from pipelines.export.tables import write_tables
+from pipelines.specs.study import Study
+from pipelines.tracking.plan import items, study_card
+from pipelines.tracking.tracker import MemoryTracker
+from pipelines.workspace.errors import InputError
+from reports.analyses.equivalence import read
+from rhmc.training.trainer import Trainer
 from tests.pipelines.support import setting, tiny
 
 STUDY = tiny(arms={"slow": setting(lr=1e-4), "fast": setting(lr=1e-2)}).model_copy(update={"seeds": 2})
@@ -119,7 +119,7 @@ def test_runs_trained_anew(exported: Path, monkeypatch: pytest.MonkeyPatch) -> N
     publish(*read(exported), "quick")
     said = verify("--retrain", "3", "--jobs", "1")
     assert said == (0, "byte-equal to the published quick results: 3 arms\n")
-    monkeypatch.setattr("rhmc.qlearning.linear", lambda start, end, over, step: 0.9)
+    monkeypatch.setattr("rhmc.algorithms.qlearning.linear", lambda start, end, over, step: 0.9)
     said = verify("--retrain", "3", "--jobs", "1", "--seed", "1")
     assert said.code == 1
     assert "first difference: seed" in " ".join(said.text.split())

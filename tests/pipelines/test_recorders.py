@@ -8,17 +8,17 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from pipelines import ray_driver
-from pipelines.errors import InputError
-from pipelines.mlflow_tracker import MlflowTracker, open_existing
-from pipelines.plan import study_card
-from pipelines.progress import PlainBoard
-from pipelines.recorder import Recorder
-from pipelines.recorders import Recorders
-from pipelines.run import run_studies
-from pipelines.store import Home, StoreError
-from pipelines.study import Study
-from pipelines.tracker import MemoryRun, MemoryTracker, StudyCard, points_of
+from pipelines.execution import ray_driver
+from pipelines.execution.joint_recorder import Recorders
+from pipelines.execution.progress import PlainBoard
+from pipelines.execution.recorder import Recorder
+from pipelines.execution.run import run_studies
+from pipelines.specs.study import Study
+from pipelines.tracking.mlflow_tracker import MlflowTracker, open_existing
+from pipelines.tracking.plan import study_card
+from pipelines.tracking.tracker import MemoryRun, MemoryTracker, StudyCard, points_of
+from pipelines.workspace.errors import InputError
+from pipelines.workspace.work_folder import Home, StoreError
 from tests.pipelines.chaos import fit_here
 from tests.pipelines.support import CODE, plan, setting, tiny
 
@@ -160,7 +160,7 @@ def test_what_another_process_finished_meanwhile_is_copied(both: Recorders, shel
 def test_a_run_is_finished_once_all_of_it_is_kept(both: Recorders, monkeypatch: pytest.MonkeyPatch) -> None:
     for item in both.todo()[1:]:
         train(both, item.key)
-    monkeypatch.setattr("pipelines.recorder.keep", full)
+    monkeypatch.setattr("pipelines.execution.recorder.keep", full)
     with pytest.raises(StoreError):
         train(both, both.todo()[0].key)
     assert [one.status for one in both.each] == ["interrupted", "interrupted"]

@@ -9,17 +9,19 @@ import torch
 from PIL import Image
 from torch import Generator
 
-from pipelines import animation, cli, policy, render
-from pipelines.animation import Panel, Scene, gif
-from pipelines.errors import InputError
-from pipelines.policy import Actor, Saved
-from pipelines.store import Home
-from pipelines.study import RunSpec
-from pipelines.trainable import RunTrainable
+from pipelines.cli.main import main as cli
+from pipelines.execution.trainable import RunTrainable
+from pipelines.policies import animation, render
+from pipelines.policies.animation import Panel, Scene, gif
+from pipelines.specs.study import RunSpec
+from pipelines.tracking import policy
+from pipelines.tracking.policy import Actor, Saved
+from pipelines.workspace.errors import InputError
+from pipelines.workspace.work_folder import Home
 from rhmc.envs import coverage, navigation
-from rhmc.evaluate import evaluate
 from rhmc.scripted import BOUNDS
-from rhmc.trainer import Trainer
+from rhmc.training.evaluation import evaluate
+from rhmc.training.trainer import Trainer
 from tests.pipelines.test_policy import run
 from tests.pipelines.test_trainable import finish, job, same
 
@@ -218,7 +220,7 @@ def test_the_command_draws_a_file(
 
 
 def test_a_run_of_the_log_is_drawn_and_an_unfinished_one_is_not(home: Path, tmp_path: Path) -> None:
-    from pipelines.mlflow_tracker import MlflowTracker
+    from pipelines.tracking.mlflow_tracker import MlflowTracker
     from tests.pipelines.test_policy import CARD, STUDY
 
     tracker = MlflowTracker(STUDY, Home(home))

@@ -24,19 +24,19 @@ from filelock import FileLock
 from rich.console import Console
 from ruamel.yaml import YAML
 
-from pipelines import progress, ray_driver, run, trainable
-from pipelines.export import export_study
-from pipelines.mlflow_tracker import MlflowTracker, open_existing
-from pipelines.plan import Item, commit, items, study_card, what_varies
-from pipelines.progress import LiveBoard, PlainBoard, duration
-from pipelines.recorder import Recorder
-from pipelines.recorders import Recorders
-from pipelines.run import Interrupts, _arguments, animated, run_studies, show_status
-from pipelines.store import Checkpoints, Home, StoreError
-from pipelines.study import Study
-from pipelines.tracker import MemoryRun, MemoryTracker, StudyCard, points_of
+from pipelines.execution import progress, ray_driver, run, trainable
+from pipelines.execution.joint_recorder import Recorders
+from pipelines.execution.progress import LiveBoard, PlainBoard, duration
+from pipelines.execution.recorder import Recorder
+from pipelines.execution.run import Interrupts, _arguments, animated, run_studies, show_status
+from pipelines.export.tables import export_study
+from pipelines.specs.study import Study
+from pipelines.tracking.mlflow_tracker import MlflowTracker, open_existing
+from pipelines.tracking.plan import Item, commit, items, study_card, what_varies
+from pipelines.tracking.tracker import MemoryRun, MemoryTracker, StudyCard, points_of
+from pipelines.workspace.work_folder import Checkpoints, Home, StoreError
 from rhmc.algorithms import iql
-from rhmc.trainer import Trainer
+from rhmc.training.trainer import Trainer
 from tests.pipelines.chaos import fit_here
 from tests.pipelines.support import CODE, plan, setting, spec, tiny
 
@@ -514,8 +514,8 @@ PRINTS = """
 import sys
 from pathlib import Path
 from rich.console import Console
-from pipelines.progress import PlainBoard, StopFile
-from pipelines.run import Interrupts
+from pipelines.execution.progress import PlainBoard, StopFile
+from pipelines.execution.run import Interrupts
 board, path = PlainBoard(Console()), Path(sys.argv[1])
 with Interrupts() as interrupts, interrupts.go_to(path):
     stop = StopFile(path, board)
@@ -626,7 +626,7 @@ def test_run_skip_fail_and_retry(home: Path, cluster: None, capsys: pytest.Captu
 
 
 def test_the_kept_policy_acts(tmp_path: Path) -> None:
-    from pipelines.store import save_atomically, without_replay
+    from pipelines.workspace.work_folder import save_atomically, without_replay
 
     one = spec(3)
     trainer = Trainer(one.env, one.algo, one.trainer, one.seed)
@@ -663,7 +663,7 @@ def test_a_run_that_is_stopped_before_it_begins_has_not_failed(
     home: Path, cluster: None, launch: Launch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As when Ctrl-C comes while Ray still makes the worker."""
-    from pipelines.ray_driver import Bridge, fit
+    from pipelines.execution.ray_driver import Bridge, fit
 
     monkeypatch.setattr(Bridge, "over", property(lambda self: self.error is not None))
     recorder, stop = Recorders([launch()]), home / "stop"
@@ -689,7 +689,7 @@ def test_a_commit_is_dirty_by_code_and_not_by_results(tmp_path: Path) -> None:
         names = ("-c", "user.name=n", "-c", "user.email=e")
         subprocess.run(["git", *names, *words], cwd=tmp_path, check=True, capture_output=True)
 
-    files = [tmp_path / name for name in ("rhmc/a.py", "reports/page.py", "reports/paper/claims.md", "dvc.lock")]
+    files = [tmp_path / name for name in ("rhmc/a.py", "reports/pages/page.py", "reports/paper/claims.md", "dvc.lock")]
     for file in files:
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text("one\n")

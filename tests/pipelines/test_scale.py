@@ -12,17 +12,17 @@ from ray.tune.experiment import Experiment
 from ray.tune.search import SearchGenerator
 from rich.console import Console
 
-from pipelines.mlflow_tracker import LONGEST, NOTE, MlflowTracker, addresses, fitting
-from pipelines.overview import Run, so_far
-from pipelines.plan import LISTED, Item, study_card
-from pipelines.progress import PlainBoard
-from pipelines.ray_driver import Queue
-from pipelines.recorder import Recorder
-from pipelines.run import _arms
-from pipelines.store import Home
-from pipelines.study import Setting, Study
-from pipelines.tracker import MemoryRun, MemoryTracker, Row, StudyCard
-from pipelines.trainable import RunTrainable
+from pipelines.execution.progress import PlainBoard
+from pipelines.execution.ray_driver import Queue
+from pipelines.execution.recorder import Recorder
+from pipelines.execution.run import _arms
+from pipelines.execution.trainable import RunTrainable
+from pipelines.specs.study import Setting, Study
+from pipelines.tracking.mlflow_tracker import LONGEST, NOTE, MlflowTracker, addresses, fitting
+from pipelines.tracking.overview import Run, so_far
+from pipelines.tracking.plan import LISTED, Item, study_card
+from pipelines.tracking.tracker import MemoryRun, MemoryTracker, Row, StudyCard
+from pipelines.workspace.work_folder import Home
 from tests.pipelines.support import plan, setting, tiny
 
 STUDY = StudyCard("tiny", "quick", "")

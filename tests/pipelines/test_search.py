@@ -21,22 +21,22 @@ from optuna.storages import InMemoryStorage
 from rich.console import Console
 from ruamel.yaml import YAML
 
-from pipelines import cli
-from pipelines.found import file_name, winner_yaml
-from pipelines.health import DivergedError
-from pipelines.mlflow_tracker import open_existing
-from pipelines.pool import Failed
-from pipelines.progress import PlainBoard
-from pipelines.search import EVAL_SEED, FIRST_SEED, Dimension, Search
-from pipelines.search_plots import plots
-from pipelines.search_run import Book, Drive, results, run_search, search_card, show_search
-from pipelines.seeds import Seeds
-from pipelines.store import Home, StoreError
-from pipelines.study import Setting, Study, StudyError
-from pipelines.tracker import MemoryRun, MemoryTracker, points_of
-from pipelines.trainable import ending
-from pipelines.trials import ATTEMPTS, Ledger, look, open_storage
-from rhmc.trainer import Trainer
+from pipelines.cli.main import main as cli
+from pipelines.execution.finite import DivergedError
+from pipelines.execution.progress import PlainBoard
+from pipelines.execution.seed_group import Seeds
+from pipelines.execution.trainable import ending
+from pipelines.specs.search import EVAL_SEED, FIRST_SEED, Dimension, Search
+from pipelines.specs.study import Setting, Study, StudyError
+from pipelines.tracking.mlflow_tracker import open_existing
+from pipelines.tracking.tracker import MemoryRun, MemoryTracker, points_of
+from pipelines.tuning.best_params import file_name, winner_yaml
+from pipelines.tuning.ray_workers import Failed
+from pipelines.tuning.search_plots import plots
+from pipelines.tuning.search_run import Book, Drive, results, run_search, search_card, show_search
+from pipelines.tuning.trials import ATTEMPTS, Ledger, look, open_storage
+from pipelines.workspace.work_folder import Home, StoreError
+from rhmc.training.trainer import Trainer
 from tests.pipelines.support import CODE, setting
 from tests.pipelines.test_trainable import same
 
@@ -120,7 +120,7 @@ def test_more_trials_continue_a_search_and_anything_else_begins_another() -> Non
     assert identity(changed("quick: 5", "quick: 50")) == first
     assert identity(GOOD.replace("high: 32", "high: 31")) == first  # of the other arm
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pipelines.search.code_id", lambda *place: "0ther")
+        patch.setattr("pipelines.specs.search.code_id", lambda *place: "0ther")
         assert identity(GOOD) != first
     for old, new in [
         ("high: 0.9", "high: 0.8"),
@@ -712,7 +712,7 @@ def test_trials_of_other_code_are_stale(tmp_path: Path) -> None:
     world = World(load(), tmp_path)
     world.launch()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pipelines.search.code_id", lambda *place: "0ther")
+        patch.setattr("pipelines.specs.search.code_id", lambda *place: "0ther")
         ledger, stale = look(world.search, "IQL", world.storage)
     assert (ledger.closed, stale) == (0, 5)
     ledger, stale = look(world.search, "IQL", world.storage)
@@ -829,7 +829,7 @@ def fresh(project: Path, name: str) -> Path:
 
 def command(verb: str) -> list[str]:
     words = ["search", verb, "studies/search_x.yaml", "--set", "trials=2", "--set", "steps=2400"]
-    return [sys.executable, "-W", "ignore", "-m", "pipelines.cli", *words]
+    return [sys.executable, "-W", "ignore", "-m", "pipelines.cli.main", *words]
 
 
 def environment(work: Path) -> dict[str, str]:

@@ -12,9 +12,9 @@ import psutil
 import pytest
 import torch
 
-from pipelines.errors import InputError
-from pipelines.side_by_side import side_by_side
-from pipelines.store import StoreError
+from pipelines.workspace.errors import InputError
+from pipelines.workspace.process_pool import side_by_side
+from pipelines.workspace.work_folder import StoreError
 from tests.pipelines.support import started_by
 
 ROOT = Path(__file__).parents[2]
@@ -142,7 +142,7 @@ def _listening() -> Iterator[None]:
 def test_nothing_is_left_of_a_command_that_is_stopped(how: signal.Signals, at_work: float, tmp_path: Path) -> None:
     """Ctrl-C reaches every process of a terminal, the other signals the one that was named."""
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "pipelines.cli", "yardsticks", "all", "--profile", "paper", "--out", str(out)]
+    command = [sys.executable, "-m", "pipelines.cli.main", "yardsticks", "all", "--profile", "paper", "--out", str(out)]
     with (tmp_path / "said").open("w") as said:
         process = subprocess.Popen(command, cwd=ROOT, stdout=said, stderr=said, start_new_session=True)
     try:

@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
-from pipelines.mlflow_tracker import MlflowTracker
-from pipelines.plan import Item, items, resolved_yaml, study_card
-from pipelines.stale import reasons
-from pipelines.store import Home
-from pipelines.study import RunSpec
-from pipelines.tracker import MemoryTracker, Tracker
+from pipelines.specs.study import RunSpec
+from pipelines.tracking.mlflow_tracker import MlflowTracker
+from pipelines.tracking.plan import Item, items, resolved_yaml, study_card
+from pipelines.tracking.staleness import reasons
+from pipelines.tracking.tracker import MemoryTracker, Tracker
+from pipelines.workspace.work_folder import Home
 from tests.pipelines.support import setting, tiny
 
 STUDY = tiny()
@@ -33,10 +33,10 @@ def test_modules_settings_arms_and_seeds_are_told_apart() -> None:
     slow, fast = items(STUDY)
     tracker = MemoryTracker(CARD, [])
     code = dict(slow.card.modules)
-    log(tracker, slow, code | {"rhmc.qlearning": "other", "rhmc.gone": "digest"})
+    log(tracker, slow, code | {"rhmc.algorithms.qlearning": "other", "rhmc.gone": "digest"})
     log(tracker, changed(fast, gamma=0.5, hidden=17), code)
     assert reasons(items(STUDY), tracker.recorded(), tracker) == [
-        "stale: arm 'slow', 1 run: changed since: rhmc.gone, rhmc.qlearning",
+        "stale: arm 'slow', 1 run: changed since: rhmc.gone, rhmc.algorithms.qlearning",
         "stale: arm 'fast', 1 run: other settings: algo.gamma was 0.5, now 0.99, algo.hidden was 17, now 64",
     ]
     assert reasons(items(STUDY), [], tracker) == []
@@ -78,8 +78,8 @@ def test_runs_of_one_reason_are_one_line_and_many_settings_are_cut() -> None:
 def test_mlflow_keeps_the_list(home: Path) -> None:
     slow = items(STUDY)[0]
     tracker = MlflowTracker(CARD, Home(home))
-    log(tracker, slow, {"rhmc.trainer": "other"})
+    log(tracker, slow, {"rhmc.training.trainer": "other"})
     (run,) = tracker.recorded()
-    assert dict(run.modules) == {"rhmc.trainer": "other"}
+    assert dict(run.modules) == {"rhmc.training.trainer": "other"}
     (line,) = reasons(items(STUDY), [run], tracker)
     assert line.endswith("rhmc.types") or " more" in line

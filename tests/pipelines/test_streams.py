@@ -11,9 +11,11 @@ from typing import Any
 
 import pytest
 
-from pipelines import cli, plan, streams
-from pipelines.doctor import code
-from pipelines.plan import Commit, read_commit
+from pipelines.cli.checks import code
+from pipelines.cli.main import main as cli
+from pipelines.tracking import plan
+from pipelines.tracking.plan import Commit, read_commit
+from pipelines.workspace import streams
 from tests.pipelines.malformed import GOOD
 
 ASCII = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
@@ -24,7 +26,7 @@ ROOT = Path(__file__).parents[2]
 
 def rhmc(*words: str, env: dict[str, str] | None = None, **options: Any) -> "subprocess.CompletedProcess[bytes]":
     """The command, as a process of its own."""
-    command = [sys.executable, "-m", "pipelines.cli", *words]
+    command = [sys.executable, "-m", "pipelines.cli.main", *words]
     environment = os.environ | {"PYTHONPATH": str(ROOT)} | (env or {})
     given: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | options
     return subprocess.run(command, env=environment, cwd=ROOT, check=False, **given)
@@ -77,7 +79,7 @@ def test_a_reader_that_leaves_ends_nothing(study: Path, words: list[str]) -> Non
 
 
 def test_a_stream_that_is_closed_is_no_fault(study: Path) -> None:
-    command = f'"{sys.executable}" -m pipelines.cli study check "{study}" >&-'
+    command = f'"{sys.executable}" -m pipelines.cli.main study check "{study}" >&-'
     done = subprocess.run(["sh", "-c", command], cwd=ROOT, capture_output=True, check=False)
     assert (done.returncode, done.stderr) == (0, b"")
 
@@ -94,7 +96,9 @@ LAUNCH = """
 import os, sys
 from contextlib import nullcontext
 from pathlib import Path
-from pipelines import ray_driver, run, streams
+from pipelines.execution import ray_driver
+from pipelines.execution import run
+from pipelines.workspace import streams
 from tests.pipelines.chaos import fit_here
 from tests.pipelines.support import CODE, tiny
 streams.settle()
@@ -111,8 +115,8 @@ def test_a_launch_goes_on_when_nobody_reads_any_more(home: Path) -> None:
     done = subprocess.run(command, cwd=ROOT, stdout=ours, stderr=subprocess.PIPE, check=False)
     os.close(ours)
     assert done.returncode == 0, done.stderr
-    from pipelines.mlflow_tracker import open_existing
-    from pipelines.store import Home
+    from pipelines.tracking.mlflow_tracker import open_existing
+    from pipelines.workspace.work_folder import Home
     from tests.pipelines.support import tiny
 
     tracker = open_existing(plan.study_card(tiny()), Home(home))
@@ -200,7 +204,7 @@ def test_why_a_commit_cannot_be_read_is_said(
 def test_a_launch_says_it_once(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], home: Path) -> None:
     from contextlib import nullcontext
 
-    from pipelines import ray_driver, run
+    from pipelines.execution import ray_driver, run
     from tests.pipelines.chaos import fit_here
     from tests.pipelines.support import tiny
 

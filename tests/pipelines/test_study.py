@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipelines.document import Node, Place, merge, plain
-from pipelines.study import PROFILES, RunSpec, Study, StudyError, changes
+from pipelines.specs.document import Node, Place, merge, plain
+from pipelines.specs.study import PROFILES, RunSpec, Study, StudyError, changes
 from rhmc.algorithms import ALGORITHMS
 
 GOOD = """\

@@ -6,9 +6,9 @@ import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
-from pipelines.cli import app
-from pipelines.errors import InputError
-from rhmc.theorem import shortfall_table
+from pipelines.cli.main import app
+from pipelines.workspace.errors import InputError
+from rhmc.hierarchy.theorem import shortfall_table
 
 
 def test_export_holds_the_counts_of_every_row(tmp_path: Path) -> None:

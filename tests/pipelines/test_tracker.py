@@ -12,13 +12,13 @@ from pathlib import Path
 import pytest
 from mlflow import MlflowClient
 
-from pipelines import histories, mlflow_tracker
-from pipelines.addresses import without_password
-from pipelines.host import Host
-from pipelines.mlflow_tracker import MlflowTracker, open_existing
-from pipelines.names import shown
-from pipelines.store import Home, StoreError
-from pipelines.tracker import Card, MemoryRun, MemoryTracker, Row, StudyCard, Tracker, points_of
+from pipelines.specs.safe_names import shown
+from pipelines.tracking import histories, mlflow_tracker
+from pipelines.tracking.mlflow_tracker import MlflowTracker, open_existing
+from pipelines.tracking.tracker import Card, MemoryRun, MemoryTracker, Row, StudyCard, Tracker, points_of
+from pipelines.workspace.addresses import without_password
+from pipelines.workspace.provenance import Host
+from pipelines.workspace.work_folder import Home, StoreError
 from tests.pipelines.chaos import Server
 
 STUDY = StudyCard("demo", "quick", "**Why?**")

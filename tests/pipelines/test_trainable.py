@@ -16,14 +16,21 @@ from typing import Any
 import pytest
 import torch
 
-from pipelines import store
-from pipelines.cluster import here
-from pipelines.health import DivergedError, check, defined
-from pipelines.seeds import Seeds
-from pipelines.store import Checkpoints, DamagedError, StoreError, load_whole, save_atomically, without_replay
-from pipelines.trainable import RunTrainable
+from pipelines.execution.cluster import here
+from pipelines.execution.finite import DivergedError, check, defined
+from pipelines.execution.seed_group import Seeds
+from pipelines.execution.trainable import RunTrainable
+from pipelines.workspace import work_folder as store
+from pipelines.workspace.work_folder import (
+    Checkpoints,
+    DamagedError,
+    StoreError,
+    load_whole,
+    save_atomically,
+    without_replay,
+)
 from rhmc.algorithms import ALGORITHMS
-from rhmc.trainer import Trainer
+from rhmc.training.trainer import Trainer
 from tests.pipelines.chaos import DAMAGES, damaged
 from tests.pipelines.support import setting, spec
 
@@ -495,7 +502,7 @@ def test_a_process_goes_on_with_the_next_run(start: Start, tmp_path: Path) -> No
 
 
 def test_a_run_is_trained_by_one_process_at_a_time(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipelines.trainable.PATIENCE", 0.0)
+    monkeypatch.setattr("pipelines.execution.trainable.PATIENCE", 0.0)
     run = start()
     assert start().step() == {
         "done": True,

@@ -6,12 +6,12 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from pipelines import cli
-from pipelines.errors import InputError
-from pipelines.evaluation import Bank, Policy, score
-from pipelines.policy import Saved
-from pipelines.store import without_replay
-from pipelines.transfer import TRANSFER, Size, export_transfer, sizes, transfer
+from pipelines.cli.main import main as cli
+from pipelines.policies.evaluation import Bank, Policy, score
+from pipelines.policies.transfer import TRANSFER, Size, export_transfer, sizes, transfer
+from pipelines.tracking.policy import Saved
+from pipelines.workspace.errors import InputError
+from pipelines.workspace.work_folder import without_replay
 from tests.pipelines.support import jobs_of
 from tests.pipelines.test_evaluation import of_kind, trained
 
@@ -55,7 +55,9 @@ def test_a_policy_under_way_goes_to_another_process_without_its_replay(monkeypat
     one = of_kind("iql", "pairwise")
     trainer, _ = trained(one)
     given: list[Policy] = []
-    monkeypatch.setattr("pipelines.transfer.side_by_side", lambda function, items, jobs: given.extend(items) or ())
+    monkeypatch.setattr(
+        "pipelines.policies.transfer.side_by_side", lambda function, items, jobs: given.extend(items) or ()
+    )
     whole = trainer.state_dict()["algorithm"]
     assert list(transfer("tiny", [Policy("IQL", Saved(one, whole))], [3], [], 8)) == []
     sizes = [len(pickle.dumps(state)) for state in (given[0].saved.algorithm, without_replay(whole), whole)]
@@ -90,8 +92,8 @@ def test_bad_numbers_are_one_line(
 def test_what_another_process_cannot_play_is_one_line(
     jobs: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    policies, seen = [policy(), policy("mlp")], jobs_of("pipelines.transfer", monkeypatch)
-    monkeypatch.setattr("pipelines.evaluation.of_study", lambda *given: iter(policies))
+    policies, seen = [policy(), policy("mlp")], jobs_of("pipelines.policies.transfer", monkeypatch)
+    monkeypatch.setattr("pipelines.policies.evaluation.of_study", lambda *given: iter(policies))
     words = ["studies/coverage.yaml", "--agents", "3", "--episodes", "4", "--out", str(tmp_path), "--jobs", jobs]
     monkeypatch.setattr("sys.argv", ["rhmc", "transfer", *words])
     with pytest.raises(SystemExit) as left:

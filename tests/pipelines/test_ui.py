@@ -11,14 +11,16 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from pipelines import legend, mlflow_tracker, overview, views
-from pipelines.mlflow_tracker import MlflowTracker, addresses
-from pipelines.names import HEADLINES, full, shown
-from pipelines.overview import Overview, Run, figure, so_far, table
-from pipelines.plan import study_card
-from pipelines.store import Home
-from pipelines.study import Setting
-from pipelines.tracker import Card, MemoryRun, MemoryTracker, StudyCard, points_of
+from pipelines.specs.safe_names import HEADLINES, full, shown
+from pipelines.specs.study import Setting
+from pipelines.tracking import arm_colours as legend
+from pipelines.tracking import mlflow_tracker, overview
+from pipelines.tracking import saved_views as views
+from pipelines.tracking.mlflow_tracker import MlflowTracker, addresses
+from pipelines.tracking.overview import Overview, Run, figure, so_far, table
+from pipelines.tracking.plan import study_card
+from pipelines.tracking.tracker import Card, MemoryRun, MemoryTracker, StudyCard, points_of
+from pipelines.workspace.work_folder import Home
 from rhmc.algorithms import ALGORITHMS
 from tests.pipelines.support import plan, setting, tiny
 

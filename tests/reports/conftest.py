@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from reports import stats
-from reports.build import build
+from reports.data import stats
+from reports.pages.build import build
 from tests.reports.factory import drawings, episode, half_done, methods, noisy, study, theorem, write, yardsticks
 
 

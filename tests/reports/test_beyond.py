@@ -7,8 +7,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from reports import beyond
-from reports.frame import Results, TableError, load
+from reports.analyses import beyond
+from reports.data.frame import Results, TableError, load
 from tests.reports.factory import (
     COVERAGE,
     SCRIPTED,

@@ -13,11 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.text import Text
 
-from reports import build as report
-from reports import figures, tables
-from reports.build import build, main
-from reports.frame import TableError, load
-from reports.paper import read
+from reports.data.frame import TableError, load
+from reports.data.paper import read
+from reports.pages import build as report
+from reports.pages.build import build, main
+from reports.render import figures, tables
 from tests.reports.factory import NAVIGATION, SCRIPTED, methods, noisy, study, theorem, write, yardsticks
 
 ROOT = Path(__file__).parents[2]
@@ -71,7 +71,7 @@ def test_the_same_bytes_in_another_process_with_other_settings(runs: Path, made:
     (tmp_path / "matplotlibrc").write_text("font.size: 20\nsavefig.dpi: 50\npdf.compression: 1\n")
     out = tmp_path / "report"
     env = os.environ | {"PYTHONHASHSEED": "7", "MATPLOTLIBRC": str(tmp_path), "TZ": "Asia/Tokyo"}
-    call = [sys.executable, "-m", "reports.build", "--runs", str(runs), "--out", str(out)]
+    call = [sys.executable, "-m", "reports.pages.build", "--runs", str(runs), "--out", str(out)]
     said = subprocess.run(call, cwd=ROOT, env=env, check=True, capture_output=True, text=True).stdout
     assert said == f"{len(content(out))} files; start with {out / 'index.html'}\n"
     first, second = content(made), content(out)

@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import norm, t
 
-from reports import comparison, stats
-from reports.frame import Results, load
+from reports.analyses import comparison
+from reports.data import stats
+from reports.data.frame import Results, load
 from tests.reports.factory import NAVIGATION, noisy, study, write, yardsticks
 
 chances = st.lists(st.floats(0, 1), min_size=1, max_size=6).map(np.array)

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from matplotlib.text import Text
 
-from reports import canvas, diagrams, scenes
-from reports.drawn import Build, Scenes, read_modules, read_scenes
+from reports.data.drawn import Build, Scenes, read_modules, read_scenes
+from reports.render import canvas, diagrams, scenes
 from tests.reports import factory
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from reports import frame
-from reports.frame import TableError, load
+from reports.data import frame
+from reports.data.frame import TableError, load
 from tests.reports import factory
 from tests.reports.factory import COVERAGE, NAVIGATION, Tables, study, write, yardsticks
 

@@ -9,9 +9,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from reports import page
-from reports.build import build, main
-from reports.frame import TableError
+from reports.data.frame import TableError
+from reports.pages import page
+from reports.pages.build import build, main
 from tests.reports.factory import noisy, study, write, yardsticks
 
 pytestmark = pytest.mark.usefixtures("quick_resampling")

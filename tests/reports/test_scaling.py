@@ -7,10 +7,10 @@ import pandas as pd
 import pytest
 from matplotlib.text import Text
 
-from reports import scaling
+from reports.analyses import scaling
 from reports.claims import judge
-from reports.frame import Results, load, without_count
-from reports.paper import read
+from reports.data.frame import Results, load, without_count
+from reports.data.paper import read
 from tests.reports.factory import COVERAGE, Tables, noisy, study, write, yardsticks
 
 pytestmark = pytest.mark.usefixtures("quick_resampling")

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import bootstrap, norm, t
 
-from reports import stats
+from reports.data import stats
 
 samples = st.lists(st.integers(-50, 50).map(float), min_size=2, max_size=10).map(np.array)
 

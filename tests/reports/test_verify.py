@@ -8,9 +8,9 @@ import pandas as pd
 import pytest
 from scipy.stats import t
 
-from reports.frame import TableError
-from reports.stats import equivalence
-from reports.verify import compare, differing, finals, read, summary, table
+from reports.analyses.equivalence import compare, differing, finals, read, summary, table
+from reports.data.frame import TableError
+from reports.data.stats import equivalence
 from tests.reports import factory
 
 SEEDS = [60.0, 60.2, 59.9, 60.1, 60.3]

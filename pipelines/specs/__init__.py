@@ -1,0 +1,1 @@
+"""YAML files become validated settings with an identity. Nothing is trained or logged here."""

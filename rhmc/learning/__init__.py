@@ -1,0 +1,1 @@
+"""Parts that every learner uses: replay, returns, normalisation, optimisation, settings, checkpoints."""
