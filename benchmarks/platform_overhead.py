@@ -1,8 +1,8 @@
 """What Ray, MLflow and checkpoints cost: the same trainings in a bare loop and through `rhmc study run`.
 
-Bare: a loop over `rhmc.training.trainer.Trainer` in plain processes, two at a time; no Ray, no log, no checkpoint. Both sides
-train the arms `full` and `no filter` of studies/ablation.yaml with two seeds each, bare and platform in turn, and must
-end with the same returns. Prints Markdown.
+Bare: a loop over `rhmc.training.trainer.Trainer` in plain processes, two at a time; no Ray, no log, no checkpoint. Both
+sides train the arms `full` and `no filter` of studies/ablation.yaml with two seeds each, bare and platform in turn, and
+must end with the same returns. Prints Markdown.
 
 Seconds of processor time come from the processes themselves, those of Ray's own processes from looking at them once a
 second. Evaluation is part of training. The parts of a launch are timed where they happen, inside one launch: where
@@ -164,7 +164,7 @@ def platform(changes: list[str], out: Path) -> None:
     import ray
     from ray import tune
 
-    from pipelines.cli.main import main as cli
+    from pipelines.cli import main as cli
     from pipelines.execution import ray_driver, recorder
     from pipelines.tracking import mlflow_tracker, overview
 

@@ -103,7 +103,7 @@ class Simulated(RunTrainable):
 
 def drive(file: Path, until: int, out: Path) -> None:
     """`rhmc study run`, interrupted after so many finished runs (0: not)."""
-    from pipelines.cli.main import main as cli
+    from pipelines.cli import main as cli
     from pipelines.execution import ray_driver, recorder, run
     from pipelines.tracking import mlflow_tracker, overview
 

@@ -5,6 +5,7 @@ import re
 import sys
 import tomllib
 from collections.abc import Iterable, Iterator
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,9 +32,47 @@ ALLOWED = {
         *("markupsafe", "tabulate"),
     },
 }
-VERBS = ("common", "doctor", "evaluate", "render", "science", "search", "study", "ui", "verify", "yardsticks")
-# What writes words of users where they are read: these take `reports.data.escaping` and `reports.render.glyphs`, and nothing else.
-WRITERS = ("overview", "plan", "search_run", "search_plots")
+# The rooms of each package, top first, and those that each imports: a room imports only rooms above it. A module that
+# stands beside the rooms is a room of its own.
+ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
+    "rhmc": {
+        "portable": (),
+        "types": (),
+        "registry": (),
+        "envs": ("types", "registry"),
+        "scripted": ("envs",),
+        "networks": ("types",),
+        "learning": ("types", "networks"),
+        "hierarchy": ("types", "networks", "learning"),
+        "algorithms": ("types", "registry", "networks", "learning", "hierarchy"),
+        "training": ("types", "envs", "learning", "algorithms"),
+    },
+    "pipelines": {
+        "workspace": (),
+        "specs": ("workspace",),
+        "tracking": ("workspace", "specs"),
+        "export": ("workspace", "specs", "tracking"),
+        "policies": ("workspace", "specs", "tracking", "export"),
+        "execution": ("workspace", "specs", "tracking", "policies"),
+        "bundles": ("workspace", "specs", "tracking", "export", "execution"),
+        "tuning": ("workspace", "specs", "tracking", "execution"),
+        "cli": ("workspace", "specs", "tracking", "export", "policies", "execution", "bundles", "tuning"),
+    },
+    "reports": {
+        "data": (),
+        "render": ("data",),
+        "analyses": ("data", "render"),
+        "claims": ("data", "render"),
+        "pages": ("data", "render", "analyses", "claims"),
+    },
+}
+FULL = 16  # modules of a room
+VERBS = ("common", "doctor", "evaluate", "main", "render", "science", "search", "study", "ui", "verify", "yardsticks")
+# What writes words of users where they are read: these take `reports.data.escaping` and `reports.render.glyphs` alone.
+WRITERS = tuple(
+    f"pipelines/{name}.py"
+    for name in ("tracking/overview", "tracking/plan", "tuning/search_run", "tuning/search_plots")
+)
 # What only these files may import.
 ONLY = {
     "mlflow": {
@@ -44,46 +83,23 @@ ONLY = {
     },
     "optuna": {"pipelines/tuning/trials.py", "pipelines/tuning/search_plots.py"},
     "sqlalchemy": {
-        *(
-            "pipelines/tracking/mlflow_tracker.py",
-            "pipelines/workspace/relocation.py",
-            "pipelines/workspace/sqlite.py",
-            "pipelines/tuning/trials.py",
-        ),
+        "pipelines/tracking/mlflow_tracker.py",
+        "pipelines/tuning/trials.py",
+        "pipelines/workspace/relocation.py",
+        "pipelines/workspace/sqlite.py",
     },
     "matplotlib": {"pipelines/tuning/search_plots.py", "pipelines/tracking/overview.py"},
-    "ray": {f"pipelines/{name}.py" for name in ("cluster", "own_node", "ray_driver", "trainable", "pool")},
-    "typer": {"pipelines/cli/main.py", *(f"pipelines/commands/{name}.py" for name in VERBS)},
-    "reports": {
-        "pipelines/cli/science.py",
-        "pipelines/cli/verify.py",
-        *(f"pipelines/{name}.py" for name in WRITERS),
+    "ray": {
+        *(f"pipelines/execution/{name}.py" for name in ("cluster", "private_node", "ray_driver", "trainable")),
+        "pipelines/tuning/ray_workers.py",
     },
+    "typer": {f"pipelines/cli/{name}.py" for name in VERBS},
+    "reports": {"pipelines/cli/science.py", "pipelines/cli/verify.py", *WRITERS},
 }
-# What these must not import: a physics knows no learner, a regulator neither task nor network.
+# What these must not import beside what their rooms do not: a regulator knows neither task nor network.
 BARRED = {
-    "rhmc/envs/": (
-        "rhmc.algorithms",
-        "rhmc.learning.learner",
-        "rhmc.networks.nets",
-        "rhmc.training.trainer",
-        "rhmc.training.evaluation",
-    ),
-    "rhmc/hierarchy/regulation.py": (
-        "rhmc.envs",
-        "rhmc.algorithms",
-        "rhmc.networks.nets",
-        "rhmc.learning.learner",
-        "rhmc.training.trainer",
-    ),
-    "rhmc/hierarchy/filters.py": (
-        "rhmc.envs",
-        "rhmc.algorithms",
-        "rhmc.networks.nets",
-        "rhmc.learning.learner",
-        "rhmc.training.trainer",
-    ),
-    "rhmc/algorithms/": ("rhmc.training.trainer", "rhmc.training.evaluation", "rhmc.scripted"),
+    "rhmc/hierarchy/regulation.py": ("rhmc.networks", "rhmc.learning"),
+    "rhmc/hierarchy/filters.py": ("rhmc.networks", "rhmc.learning"),
 }
 # What loading these must not load: help has to answer at once, a check of a study in seconds.
 HEAVY = {"torch", "ray", "mlflow", "numpy", "pandas", "scipy", "matplotlib", "pyarrow", "pydantic"}
@@ -141,7 +157,57 @@ def faults(path: str, source: str) -> list[str]:
             found.add(f"{path}:{item.line}: {own} may not import {item.top}")
         if any(f"{item.module}.".startswith(f"{name}.") for name in barred):
             found.add(f"{path}:{item.line}: this file may not import {item.module}")
+        if (arrow := crossing(path, item)) and arrow.to not in ROOMS[own].get(arrow.of, ROOMS[own]):
+            found.add(f"{path}:{item.line}: the room {arrow.of} may not import {item.module}")
     return sorted(found)
+
+
+class Arrow(NamedTuple):
+    """A room imports another one of its package."""
+
+    of: str
+    to: str
+
+
+def crossing(path: str, item: Import) -> Arrow | None:
+    """The arrow that an import is, if it is one; the package's own `__init__` is in no room."""
+    own, of = path.removesuffix(".py").split("/")[:2]
+    parts = item.module.split(".")
+    if parts[0] != own or len(parts) == 1 or parts[1] not in ROOMS[own] or parts[1] == of:
+        return None
+    return Arrow(of, parts[1])
+
+
+def arrows(package: str) -> dict[str, set[str]]:
+    """The rooms that each room of a package imports, as its files have it."""
+    found: dict[str, set[str]] = {room: set() for room in rooms(package)}
+    for path in files():
+        for item in imports(path, (ROOT / path).read_text(encoding="utf-8")) if path.startswith(f"{package}/") else ():
+            if (arrow := crossing(path, item)) and arrow.of in found:
+                found[arrow.of].add(arrow.to)
+    return found
+
+
+def rooms(package: str) -> list[str]:
+    """Folders and modules of a package."""
+    return sorted(
+        {path.removesuffix(".py").split("/")[1] for path in files() if path.startswith(f"{package}/")} - {"__init__"}
+    )
+
+
+def cycle(arrows: dict[str, set[str]]) -> list[str]:
+    """The rooms of one cycle, if there is one."""
+    try:
+        TopologicalSorter(arrows).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
+
+
+def unsaid(text: str) -> bool:
+    """Whether a room's docstring fails to say, in one sentence, what lives there and what does not."""
+    sentence = text.partition("\n\n")[0]
+    return not re.fullmatch(r"[^.;]+; no[^.;]+\.", " ".join(sentence.split()))
 
 
 def loaded(module: str, sources: dict[str, str]) -> set[str]:
@@ -180,13 +246,47 @@ def unmatched(what: str, wanted: Iterable[str], listed: Iterable[str]) -> list[s
 # Imports
 
 
-@pytest.mark.parametrize("name", WRITERS)
-def test_what_writes_takes_the_escapes_alone(name: str) -> None:
-    source = (ROOT / "pipelines" / f"{name}.py").read_text(encoding="utf-8")
-    taken = {i.module for i in imports(f"pipelines/{name}.py", source) if i.top == "reports"}
+@pytest.mark.parametrize("path", WRITERS)
+def test_what_writes_takes_the_escapes_alone(path: str) -> None:
+    source = (ROOT / path).read_text(encoding="utf-8")
+    taken = {i.module for i in imports(path, source) if i.top == "reports"}
     leaves = ("reports.data.escaping", "reports.render.glyphs")
-    assert {module for module in taken if not module.startswith(leaves)} <= {"reports"}
+    assert {module for module in taken if not module.startswith(leaves)} <= {"reports.data", "reports.render"}
     assert loaded("reports.data.escaping", modules()) <= {"reports", "re", "hashlib"}
+
+
+@pytest.mark.parametrize("package", ROOMS)
+def test_the_rooms_are_those_of_the_table(package: str) -> None:
+    assert arrows(package) == {room: set(above) for room, above in ROOMS[package].items()}
+
+
+@pytest.mark.parametrize("package", ROOMS)
+def test_a_room_imports_only_rooms_above_it(package: str) -> None:
+    order = list(ROOMS[package])
+    assert [(room, up) for room in order for up in ROOMS[package][room] if order.index(up) >= order.index(room)] == []
+    assert cycle(arrows(package)) == []
+
+
+def test_a_cycle_is_found() -> None:
+    assert cycle({"a": {"b"}, "b": {"c"}, "c": set()}) == []
+    assert set(cycle({"a": {"b"}, "b": {"c"}, "c": {"a"}})) == {"a", "b", "c"}
+
+
+HOUSE = sorted(
+    (ROOT / package / room) for package in ROOMS for room in ROOMS[package] if (ROOT / package / room).is_dir()
+)
+
+
+@pytest.mark.parametrize("room", HOUSE, ids=lambda room: room.relative_to(ROOT).as_posix())
+def test_a_room_says_what_lives_there_and_what_does_not(room: Path) -> None:
+    source = (room / "__init__.py").read_text(encoding="utf-8")
+    assert not unsaid(ast.get_docstring(ast.parse(source)) or "")
+    assert len(list(room.glob("*.py"))) - 1 <= FULL
+
+
+def test_a_room_that_does_not_is_found() -> None:
+    assert not unsaid("Files and locks; nothing about runs.")
+    assert all(map(unsaid, ["", "Files and locks.", "Files; locks.", "Files; no runs. And more.", "Files. No runs."]))
 
 
 @pytest.mark.parametrize("path", files())
@@ -199,12 +299,17 @@ def test_imports_follow_the_arrows(path: str) -> None:
     [
         ("rhmc/networks/nets.py", "import numpy", "numpy"),
         ("rhmc/networks/nets.py", "import torch, pandas as pd", "pandas"),
-        ("rhmc/training/trainer.py", "def f():\n    from pipelines import study", "pipelines"),
+        ("rhmc/training/trainer.py", "def f():\n    from pipelines.specs import study", "pipelines"),
         ("rhmc/training/trainer.py", "from importlib import import_module\nimport_module('mlflow')", "mlflow"),
         ("rhmc/envs/coverage.py", "from rhmc.algorithms import ALGORITHMS", "rhmc.algorithms"),
-        ("rhmc/envs/coverage.py", "from rhmc import trainer", "rhmc.training.trainer"),
-        ("rhmc/envs/coverage.py", "from ..nets import mlp", "rhmc.networks.nets"),
+        ("rhmc/envs/coverage.py", "from rhmc.training import trainer", "rhmc.training"),
+        ("rhmc/envs/coverage.py", "from rhmc import training", "rhmc.training"),
+        ("rhmc/envs/coverage.py", "from ..networks import nets", "rhmc.networks"),
         ("rhmc/hierarchy/regulation.py", "import rhmc.envs.coverage", "rhmc.envs"),
+        ("rhmc/hierarchy/regulation.py", "from rhmc.networks import nets", "rhmc.networks"),
+        ("rhmc/learning/learner.py", "def f():\n    from rhmc.hierarchy import executor", "rhmc.hierarchy"),
+        ("pipelines/specs/study.py", "from pipelines.tracking.plan import commit", "pipelines.tracking"),
+        ("pipelines/workspace/errors.py", "import pipelines.cli.main", "pipelines.cli"),
         ("reports/render/figures.py", "from rhmc.types import Frozen", "rhmc"),
         (
             "reports/pages/build.py",
@@ -228,7 +333,7 @@ def test_right_imports_pass() -> None:
     source = "import json\nfrom typing import Any\nimport torch\nfrom rhmc.types import Obs\nfrom .base import Env"
     assert faults("rhmc/envs/coverage.py", source) == []
     assert faults("pipelines/tracking/mlflow_tracker.py", "import mlflow") == []
-    assert faults("pipelines/cli/science.py", "def report():\n    from reports import build") == []
+    assert faults("pipelines/cli/science.py", "def report():\n    from reports.pages import build") == []
 
 
 @pytest.mark.parametrize("module", LIGHT)
@@ -239,7 +344,7 @@ def test_light_modules_load_nothing_heavy(module: str) -> None:
 
 
 def test_a_heavy_import_is_found_at_any_depth() -> None:
-    study = "class A:\n    try:\n        from pipelines import run\n    finally:\n        pass"
+    study = "class A:\n    try:\n        from pipelines.execution import run\n    finally:\n        pass"
     sources = {
         "pipelines.cli.main": "import typer\nfrom pipelines.specs.study import A",
         "pipelines.specs.study": study,
@@ -255,18 +360,19 @@ def test_a_heavy_import_is_found_at_any_depth() -> None:
 # Tables
 
 
+FAMILIES = {"ppo", "qlearning"}  # what the pages of a family share: no methods
+PAGES = sorted(p for p in (ROOT / "rhmc/algorithms").glob("*.py") if p.stem not in {"__init__", "base", *FAMILIES})
+
+
 def test_every_method_is_in_the_table() -> None:
-    pages = {p.stem for p in (ROOT / "rhmc/algorithms").glob("*.py")} - {"__init__", "base"}
+    pages = {page.stem for page in PAGES}
     listed = {cls.__module__.rpartition(".")[2] for cls, _, _ in ALGORITHMS.values()}
     assert unmatched("ALGORITHMS", pages, listed) == []
 
 
-@pytest.mark.parametrize("page", sorted((ROOT / "rhmc/algorithms").glob("*.py")), ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "rhmc/algorithms/base.py"], ids=lambda page: page.stem)
 def test_a_method_is_a_page(page: Path) -> None:
     assert len(page.read_text(encoding="utf-8").splitlines()) <= PAGE
-
-
-PAGES = sorted(p for p in (ROOT / "rhmc/algorithms").glob("*.py") if p.stem not in {"__init__", "base"})
 
 
 def unstated(page: str) -> list[str]:
@@ -340,12 +446,13 @@ def is_search(path: Path) -> bool:
     return path.stem.startswith("search_")
 
 
-NO_PAGE = {"reports/__init__.py", "reports/analyses/equivalence.py"}  # what no page is made with
+NO_PAGE = {"reports/analyses/equivalence.py"}  # what no page is made with
 
 
 def test_the_report_depends_on_all_its_modules(stages: dict) -> None:
-    found = [p for p in (ROOT / "reports").glob("*") if p.suffix in {".py", ".yaml", ".j2"}]
-    parts = {p.relative_to(ROOT).as_posix() for p in found}
+    places = [ROOT / "reports", *(ROOT / "reports" / room for room in ROOMS["reports"])]
+    found = [p for place in places for p in place.glob("*") if p.suffix in {".py", ".yaml", ".j2"}]
+    parts = {p.relative_to(ROOT).as_posix() for p in found if p.name != "__init__.py"}
     listed = {d for d in stages["report"]["deps"] if "${" not in d}
     assert unmatched("dvc.yaml", parts - NO_PAGE, listed) == []
 

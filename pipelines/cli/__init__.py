@@ -1,1 +1,1 @@
-"""The command `rhmc`: a module for each noun. A verb imports what is heavy itself."""
+"""The command `rhmc`, a module for each noun; no work is done here, a verb imports what does it."""

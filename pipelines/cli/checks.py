@@ -16,7 +16,7 @@ from pipelines.workspace.work_folder import Home, StoreError, one_line
 
 PYTHONS = ((3, 11), (3, 12), (3, 13))  # the first is that of the published results
 NEEDED = 2 * 2**30  # bytes free: a study of many runs with their checkpoints
-LOCK = Path(__file__).parents[1] / "requirements.lock"
+LOCK = Path(__file__).parents[2] / "requirements.lock"
 LOOPBACK = "127.0.0.1"
 SHOWN = 4  # libraries that a line names
 
@@ -100,7 +100,7 @@ def torch_build() -> list[Finding]:
 def arithmetic() -> list[Finding]:
     """Whether torch's operations give the published bytes here."""
     try:
-        from pipelines.execution.arithmetic import differing
+        from pipelines.workspace.arithmetic import differing
 
         found = differing()
     except (ImportError, OSError, RuntimeError) as error:

@@ -1,4 +1,4 @@
-"""The command `rhmc`. The verbs are in `pipelines.commands`, a module for each noun.
+"""The command `rhmc`. The verbs are the other modules of this room, one for each noun.
 
 Everything heavy is imported by the verb that needs it, so that help answers at once.
 
@@ -16,8 +16,8 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from pipelines.cli import doctor, evaluate, render, science, search, study, ui, verify, yardsticks
 from pipelines.cli.common import BAD, INTERRUPTED, UNFINISHED
-from pipelines.cli.main import doctor, evaluate, render, science, search, study, ui, verify, yardsticks
 from pipelines.workspace import streams
 from pipelines.workspace.addresses import reach_loopback, scrubbed
 from pipelines.workspace.errors import InputError, visible

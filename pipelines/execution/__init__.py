@@ -1,1 +1,1 @@
-"""Trainings on Ray Tune: launching, recording, clusters, adoption. No search."""
+"""Trainings on Ray Tune: launching, recording, clusters, adoption; no search for settings."""

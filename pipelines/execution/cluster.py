@@ -157,7 +157,7 @@ def _refused(where: str, why: str) -> StoreError:
 
 def travelling(settings: dict[str, str]) -> dict[str, Any]:
     """What a launch brings along to every node: the code that the driver runs, and Ray's settings for workers."""
-    folders = [folder_of(PACKAGE), Path(__file__).parent]
+    folders = [folder_of(name) for name in (PACKAGE, "pipelines")]
     return {"py_modules": [str(folder) for folder in folders], "env_vars": settings | {CODE: own_code()}}
 
 

@@ -1,1 +1,1 @@
-"""Trained policies in use: evaluation, transfer, assignments, animations. Nothing is trained here."""
+"""Trained policies in use: evaluation, transfer, assignments, animations; nothing is trained here."""

@@ -1,1 +1,1 @@
-"""The log of runs: plans, records, models and views in MLflow. Nothing is trained here."""
+"""The log of runs in MLflow: plans, records, models, views; nothing is trained here."""

@@ -30,7 +30,7 @@ with warnings.catch_warnings():  # MLflow's own type hints make it warn
     warnings.simplefilter("ignore")
     from mlflow.pyfunc import save_model
 
-CODE = Path(__file__).with_name("served.py")
+CODE = Path(__file__).with_name("mlflow_model.py")
 _PROFILE = re.compile(rf"-({'|'.join(PROFILES)})(-|\Z)")  # what ends the study in a model's name
 REQUIREMENTS = [f"torch=={torch.__version__.partition('+')[0]}", f"numpy=={np.__version__}"]
 

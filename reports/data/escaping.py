@@ -1,7 +1,8 @@
 """User text as each format wants it: a name, a question or a note stands in every output as it was typed.
 
 One function a format, and no other place escapes. HTML is Jinja's, which escapes whatever is not `Markup`; JSON is
-`json`'s; a figure's is `reports.render.glyphs`. Imports the standard library alone: the descriptions of a log use it as well.
+`json`'s; a figure's is `reports.render.glyphs`. Imports the standard library alone: the descriptions of a log use it as
+well.
 """
 
 import re

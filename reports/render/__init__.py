@@ -1,1 +1,1 @@
-"""Numbers become tables, figures and diagrams. Nothing is computed about arms here."""
+"""Numbers become tables, figures and diagrams; nothing is computed about arms here."""

@@ -3,10 +3,10 @@
 Source: Xu et al. 2020, section 3: executors paid by the targets assigned to them; a coordinator with attention over all
 pairs, whose critic adds up the pairs' approximate marginal contributions, holds an assignment for 10 steps and learns
 from the team's reward.
-Departures: the executors are those of `rhmc.hierarchy.executor` (off-policy, a central critic) instead of A3C, under assignments
-drawn at random (`practice`), within the run's budget (`pretrain`). Synchronous instead of A3C: rollouts of all
-environments, several epochs on each with every pair's ratio of probabilities clipped (`epochs: 1, minibatches: 1` is
-the plain actor-critic), normalised advantages, predicted returns standardised. A period that an episode cuts short
+Departures: the executors are those of `rhmc.hierarchy.executor` (off-policy, a central critic) instead of A3C, under
+assignments drawn at random (`practice`), within the run's budget (`pretrain`). Synchronous instead of A3C: rollouts of
+all environments, several epochs on each with every pair's ratio of probabilities clipped (`epochs: 1, minibatches: 1`
+is the plain actor-critic), normalised advantages, predicted returns standardised. A period that an episode cuts short
 counts for the steps it had. A pair's contribution is judged from the mean of those before it, not by attention over
 them; its order is drawn, not fixed. Truncation bootstraps.
 """

@@ -18,7 +18,7 @@ from rhmc.learning import checkpoint
 from rhmc.learning.experience import Rollout, flat, minibatches, values
 from rhmc.learning.learner import Learner, Learners, taken, unpack
 from rhmc.learning.normalisation import Standard
-from rhmc.learning.returns import gae
+from rhmc.learning.returns import gae, normalised
 from rhmc.learning.settings import Networks, OnPolicy, Standardised
 from rhmc.networks.nets import ENCODERS, Sizes, team
 from rhmc.networks.sampling import gumbel
@@ -230,8 +230,3 @@ def ratio(new: Tensor, old: Tensor, action: Tensor) -> Tensor:
 def kl(old: Tensor, new: Tensor) -> Tensor:
     """Divergence of `new` from `old`, both log-policies (B, N, actions), in nats: (B, N)."""
     return (old.exp() * (old - new)).sum(-1)
-
-
-def normalised(advantage: Tensor) -> Tensor:
-    """Mean 0 and deviation 1 over the whole batch."""
-    return (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-8)

@@ -1,10 +1,11 @@
 """RHMC: a coordinator assigns targets, executors act on them; a regulated reward and a filter steady the learning.
 
-Source: the RHMC paper, Eq. 6 to 13 and Algorithms 1 and 2; the levels are `rhmc.hierarchy.coordinator` and `rhmc.hierarchy.executor`.
+Source: the RHMC paper, Eq. 6 to 13 and Algorithms 1 and 2; the levels are `rhmc.hierarchy.coordinator` and
+`rhmc.hierarchy.executor`.
 Departures, each a field of `Config`: `coordinator: counterfactual` and `executor: expected` beside the paper's
-gradients; `executor: mixed` instead of actors (`rhmc.hierarchy.mixing_executor`); `regulator: exact` beside Algorithm 1, with a `horizon`;
-an assignment may be held (`assignment_period`); both levels may learn from the team's reward (`high_reward`,
-`low_reward`), each on a scale of its own (`standardise_h`, `standardise_l`).
+gradients; `executor: mixed` instead of actors (`rhmc.hierarchy.mixing_executor`); `regulator: exact` beside Algorithm
+1, with a `horizon`; an assignment may be held (`assignment_period`); both levels may learn from the team's reward
+(`high_reward`, `low_reward`), each on a scale of its own (`standardise_h`, `standardise_l`).
 Eq. 7, 11 and 13 are read with standard signs; truncation bootstraps.
 """
 

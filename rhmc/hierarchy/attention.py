@@ -12,12 +12,11 @@ from pydantic import Field
 from torch import Generator, Tensor, nn
 from torch.nn.functional import logsigmoid, mse_loss, scaled_dot_product_attention, softplus
 
-from rhmc.algorithms.ppo import normalised
 from rhmc.learning import checkpoint
 from rhmc.learning.experience import flat, minibatches, values
 from rhmc.learning.learner import Learner, Learners, unpack
 from rhmc.learning.normalisation import Standard
-from rhmc.learning.returns import gae
+from rhmc.learning.returns import gae, normalised
 from rhmc.learning.settings import Networks, OnPolicy, Standardised
 from rhmc.networks.nets import ENCODERS, EncoderName, Sizes, mlp
 from rhmc.networks.sampling import bernoulli

@@ -1,6 +1,7 @@
 """Executors that act greedily on their own action values, learned together through QMIX's monotone mixture.
 
-The low level of `rhmc.hierarchy.executor` beside its actors (Eq. 10 to 13): what an executor may see, and what it is paid, stay.
+The low level of `rhmc.hierarchy.executor` beside its actors (Eq. 10 to 13): what an executor may see, and what it is
+paid, stay.
 An executor's value is of its filtered row and its assignment; the mixture's weights come from what everybody sees and
 all assignments, as in Rashid et al. 2018. The mixture is one value, hence of the mean of the executors' rewards.
 """

@@ -1,1 +1,1 @@
-"""Parts that every learner uses: replay, returns, normalisation, optimisation, settings, checkpoints."""
+"""Parts that learners share: replay, returns, normalisation, optimisation, settings, checkpoints; no method."""

@@ -1,6 +1,6 @@
 """Returns and advantages of time-major sequences.
 
-Every function takes (T, B[, N]) tensors. `following` is the value of the true successor of each step, that of the
+The estimators take (T, B[, N]) tensors. `following` is the value of the true successor of each step, that of the
 last observation where an episode ends there; `terminal` says that nothing follows (no bootstrap), `ended` that the next
 row belongs to another episode. A step that is cut by a time limit is `ended` but not `terminal`: it bootstraps.
 """
@@ -46,3 +46,8 @@ def n_step(reward: Tensor, following: Tensor, terminal: Tensor, ended: Tensor, g
         longer = reward[:-1] + live[:-1] * target[1:]
         target = torch.cat((torch.where(ended[:-1], target[:-1], longer), target[-1:]))
     return target
+
+
+def normalised(advantage: Tensor) -> Tensor:
+    """Mean 0 and deviation 1 over the whole batch."""
+    return (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-8)

@@ -1,1 +1,1 @@
-"""Networks over observations, output heads, and sampling. No losses."""
+"""Networks over observations, output heads, and sampling; no losses and no optimisers."""

@@ -1,7 +1,7 @@
 """Digests of results that must not change unnoticed: `python -m tests.golden` prints them, `--write` keeps them.
 
-A digest that changes is either another arithmetic, and then `pipelines.execution.arithmetic` names the operations, or a change of
-the code that changes results, which is said in the changelog and ages the runs that it concerns.
+A digest that changes is either another arithmetic, and then `pipelines.workspace.arithmetic` names the operations, or a
+change of the code that changes results, which is said in the changelog and ages the runs that it concerns.
 """
 
 import hashlib

@@ -5,7 +5,7 @@ import sys
 
 import torch
 
-from pipelines.execution.arithmetic import differing
+from pipelines.workspace.arithmetic import differing
 from pipelines.workspace.provenance import host
 from tests.golden import FILE, cases, kept
 

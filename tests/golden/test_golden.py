@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from pipelines.execution.arithmetic import PUBLISHED, differing, operations
+from pipelines.workspace.arithmetic import PUBLISHED, differing, operations
 from rhmc.portable import SETTINGS, active
 from tests.golden import cases, kept
 
@@ -47,7 +47,7 @@ WAYS = {
 @pytest.mark.parametrize("way", WAYS)
 def test_the_arithmetic_is_settled_however_one_comes_in(way: str) -> None:
     """Also where somebody has set something else before."""
-    program = f"{WAYS[way]}\nfrom pipelines.execution.arithmetic import operations\nprint(operations())"
+    program = f"{WAYS[way]}\nfrom pipelines.workspace.arithmetic import operations\nprint(operations())"
     hostile = dict.fromkeys(SETTINGS, "default") | {"MKL_CBWR": "COMPATIBLE", "PATH": "/usr/bin:/bin"}
     said = subprocess.run([sys.executable, "-c", program], env=hostile, capture_output=True, text=True, check=True)
     assert said.stdout.strip().splitlines()[-1] == str(PUBLISHED)

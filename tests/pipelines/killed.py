@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 
 from pipelines.bundles import bundle
 from pipelines.execution import ray_driver, run
-from pipelines.export.tables import tables as export
+from pipelines.export import tables as export
 from pipelines.specs.search import Search
 from pipelines.tracking import mlflow_tracker, registry
 from pipelines.tracking.plan import Commit, study_card

@@ -39,8 +39,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipelines.bundles import bundle
-from pipelines.cli.main import main as cli
-from pipelines.export.tables import tables as export
+from pipelines.cli import main as cli
+from pipelines.export import tables as export
 from pipelines.tracking.mlflow_tracker import MlflowTracker, create_database
 from pipelines.tracking.plan import items, study_card
 from pipelines.tracking.policy import Saved, save

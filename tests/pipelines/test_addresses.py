@@ -21,7 +21,7 @@ import requests
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipelines.cli.main import main as cli
+from pipelines.cli import main as cli
 from pipelines.workspace.addresses import HIDDEN, fault, reach_loopback, scrubbed, without_password
 from tests.pipelines.chaos import free_port
 from tests.pipelines.fleet import postgres, postgres_programs, wait_for

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 import torch
 
-from pipelines.cli.main import main as cli
+from pipelines.cli import main as cli
 from pipelines.policies import assignments
 from pipelines.policies.assignments import Watch, counts, export_assignments, rows_of, watched
 from pipelines.specs.study import Study

@@ -19,11 +19,11 @@ import pandas as pd
 import pytest
 from typer.main import get_command
 
+from pipelines.cli import main as cli
+from pipelines.cli import ui
 from pipelines.cli.checks import Finding
 from pipelines.cli.doctor import MARK
-from pipelines.cli.main import main as cli
-from pipelines.cli.main import ui
-from pipelines.export.tables import yardsticks
+from pipelines.export import yardsticks
 from pipelines.specs.identity import fingerprint
 from pipelines.workspace.process_pool import KILLED
 from rhmc.scripted.yardsticks import names
@@ -678,7 +678,7 @@ def test_ui_tells_no_address_of_a_server_that_ended_at_once(
 def test_sigterm_ends_the_server_and_its_workers(tmp_path: Path) -> None:
     file = tmp_path / "pid"
     code = (
-        "import sys, subprocess; from pathlib import Path; from pipelines.commands import ui\n"
+        "import sys, subprocess; from pathlib import Path; from pipelines.cli import ui\n"
         "real = subprocess.Popen\n"
         f"server = ['sh', '-c', 'sleep 600 & echo $! > {file}.part; mv {file}.part {file}; wait']\n"
         "ui.subprocess.Popen = lambda command, **options: real(server, **options)\n"

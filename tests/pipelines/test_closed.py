@@ -18,7 +18,7 @@ import psutil
 import pytest
 import ray
 
-from pipelines.cli.main import main as cli
+from pipelines.cli import main as cli
 from pipelines.execution.cluster import ALIVE, REFUSAL, STATUS, ask
 from pipelines.execution.private_node import AUTH, FILES, INSIDE, LONGEST, allow_files, closed, private_folder
 from pipelines.workspace.work_folder import StoreError

@@ -9,7 +9,7 @@ import pytest
 from matplotlib.legend import Legend
 from rich.console import Console
 
-from pipelines.cli.main import common
+from pipelines.cli import common
 from pipelines.execution import trainable
 from pipelines.execution.progress import LiveBoard, PlainBoard, SafeBoard, print_table
 from pipelines.execution.recorder import Recorder

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
+from pipelines.cli import checks as doctor
 from pipelines.cli.checks import (
     Finding,
     arithmetic,
@@ -20,10 +21,9 @@ from pipelines.cli.checks import (
     store,
     torch_build,
 )
-from pipelines.cli.main import checks as doctor
-from pipelines.execution.arithmetic import PUBLISHED
 from pipelines.tracking.mlflow_tracker import MlflowTracker
 from pipelines.tracking.plan import study_card
+from pipelines.workspace.arithmetic import PUBLISHED
 from pipelines.workspace.work_folder import Home
 from tests.pipelines.support import CODE, plan, tiny
 

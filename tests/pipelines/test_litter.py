@@ -94,7 +94,8 @@ def test_scratch_of_the_dead_is_swept_once(temporary: Path, living: int, gone: i
 
 
 def test_a_process_killed_in_its_scratch_leaves_it_to_the_next(temporary: Path) -> None:
-    code = "from pipelines.workspace.leftovers import scratch\nwith scratch() as f:\n (f / 'x').touch()\n print(f, flush=True); input()"
+    code = "from pipelines.workspace.leftovers import scratch\n"
+    code += "with scratch() as f:\n (f / 'x').touch()\n print(f, flush=True); input()"
     environment = os.environ | {"TMPDIR": str(temporary)}
     command, pipes = [sys.executable, "-c", code], {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     with subprocess.Popen(command, env=environment, encoding="utf-8", **pipes) as process:  # type: ignore[call-overload]

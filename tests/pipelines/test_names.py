@@ -20,7 +20,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
-from pipelines.cli.main import main as cli
+from pipelines.cli import main as cli
 from pipelines.specs.safe_names import PROFILES, RESERVED, STUDY, folded, slug
 from pipelines.specs.search import Search
 from pipelines.specs.source_file import another, remember

@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 from torch import Generator
 
-from pipelines.cli.main import main as cli
+from pipelines.cli import main as cli
 from pipelines.execution.trainable import RunTrainable
 from pipelines.policies import animation, render
 from pipelines.policies.animation import Panel, Scene, gif

@@ -21,7 +21,7 @@ from optuna.storages import InMemoryStorage
 from rich.console import Console
 from ruamel.yaml import YAML
 
-from pipelines.cli.main import main as cli
+from pipelines.cli import main as cli
 from pipelines.execution.finite import DivergedError
 from pipelines.execution.progress import PlainBoard
 from pipelines.execution.seed_group import Seeds

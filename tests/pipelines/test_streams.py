@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
+from pipelines.cli import main as cli
 from pipelines.cli.checks import code
-from pipelines.cli.main import main as cli
 from pipelines.tracking import plan
 from pipelines.tracking.plan import Commit, read_commit
 from pipelines.workspace import streams

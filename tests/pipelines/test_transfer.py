@@ -6,7 +6,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from pipelines.cli.main import main as cli
+from pipelines.cli import main as cli
 from pipelines.policies.evaluation import Bank, Policy, score
 from pipelines.policies.transfer import TRANSFER, Size, export_transfer, sizes, transfer
 from pipelines.tracking.policy import Saved
