@@ -53,7 +53,7 @@ bench: $(READY) ## Speed of the environments and of training, as Markdown tables
 	@python benchmarks/train_speed.py
 
 soak: $(READY) ## Kill drivers, workers and servers of studies again and again; prints what was lost (nothing)
-	@python -m tests.pipelines.soak --kills $(KILLS) --seed $(SEED)
+	@python -m tests.robustness.soak --kills $(KILLS) --seed $(SEED)
 
 report: $(READY) ## The report again, from the exported runs
 	@profile=$$(rhmc profile) && rhmc report --profile "$$profile"

@@ -289,6 +289,11 @@ def test_a_room_that_does_not_is_found() -> None:
     assert all(map(unsaid, ["", "Files and locks.", "Files; locks.", "Files; no runs. And more.", "Files. No runs."]))
 
 
+def test_the_tests_stand_in_the_rooms_that_they_test() -> None:
+    found = {path.parent for package in ROOMS for path in (ROOT / "tests" / package).glob("*/test_*.py")}
+    assert sorted(ROOT / folder.relative_to(ROOT / "tests") for folder in found) == HOUSE
+
+
 @pytest.mark.parametrize("path", files())
 def test_imports_follow_the_arrows(path: str) -> None:
     assert faults(path, (ROOT / path).read_text(encoding="utf-8")) == []
