@@ -4,8 +4,10 @@ import ast
 import re
 import sys
 import tomllib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from graphlib import CycleError, TopologicalSorter
+from importlib import import_module
+from operator import attrgetter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -289,6 +291,75 @@ def test_a_room_that_does_not_is_found() -> None:
     assert all(map(unsaid, ["", "Files and locks.", "Files; locks.", "Files; no runs. And more.", "Files. No runs."]))
 
 
+def drawn(package: str) -> list[str]:
+    """The rooms of a package as a part of a Mermaid graph; an arrow that follows from others is left out."""
+    table = ROOMS[package]
+    lines = [f"  subgraph {package}", *(f"    {package}_{room}[{room}]" for room in table)]
+    for room, above in table.items():
+        through = {further for near in above for further in reached(table, near)}
+        lines += [f"    {package}_{room} --> {package}_{up}" for up in above if up not in through]
+    return [*lines, "  end"]
+
+
+def reached(table: Mapping[str, Iterable[str]], room: str) -> set[str]:
+    """What a room imports, directly or not."""
+    return {far for near in table[room] for far in (near, *reached(table, near))}
+
+
+def house() -> str:
+    """What `docs/architecture.md` says of the rooms: the drawing, and a sentence for each."""
+    lines = ["```mermaid", "graph BT", *(line for package in ROOMS for line in drawn(package))]
+    lines += ["  pipelines --> rhmc", "  pipelines --> reports", "```", ""]
+    for package, table in ROOMS.items():
+        lines += ["", f"| `{package}/` | |", "|---|---|", *(f"| `{room}` | {said(package, room)} |" for room in table)]
+    return "\n".join(lines)
+
+
+def said(package: str, room: str) -> str:
+    """The sentence that a room opens with."""
+    text = ast.get_docstring(ast.parse(modules()[f"{package}.{room}"])) or ""
+    return " ".join(text.split()).partition(". ")[0].rstrip(".") + "."
+
+
+PAGE_OF_THE_HOUSE = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+
+
+def test_the_page_draws_the_house_as_it_is() -> None:
+    """`python -m tests.test_architecture` prints what the page has to hold."""
+    assert house() in PAGE_OF_THE_HOUSE
+
+
+def test_an_arrow_that_follows_from_others_is_not_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(ROOMS, "x", {"a": (), "b": ("a",), "c": ("b",), "d": ("a", "c")})
+    assert [line.strip() for line in drawn("x") if "-->" in line] == ["x_b --> x_a", "x_c --> x_b", "x_d --> x_c"]
+
+
+def missing(stop: str) -> bool:
+    """Whether no `module:name` is there."""
+    module, _, name = stop.partition(":")
+    try:
+        attrgetter(name)(import_module(module))
+    except (ImportError, AttributeError):
+        return True
+    return False
+
+
+JOURNEYS = re.findall(r"^## .*?, (\d+) stops$(.*?)(?=^## |\Z)", PAGE_OF_THE_HOUSE, re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.parametrize(("count", "text"), JOURNEYS)
+def test_a_journey_goes_by_what_is_there(count: str, text: str) -> None:
+    stops = re.findall(r"^\d+\. `([\w.]+:[\w.]+)`", text, re.MULTILINE)
+    assert len(stops) == len(re.findall(r"^\d+\. ", text, re.MULTILINE)) == int(count)
+    assert [stop for stop in stops if missing(stop)] == []
+
+
+def test_there_are_two_journeys_and_a_stop_that_is_gone_is_found() -> None:
+    assert len(JOURNEYS) == 2
+    assert not missing("rhmc.training.trainer:Trainer.state_dict")
+    assert all(map(missing, ["rhmc.trainer:Trainer", "rhmc.training.trainer:Trainer.gone", "rhmc.training.trainer:x"]))
+
+
 def test_the_tests_stand_in_the_rooms_that_they_test() -> None:
     found = {path.parent for package in ROOMS for path in (ROOT / "tests" / package).glob("*/test_*.py")}
     assert sorted(ROOT / folder.relative_to(ROOT / "tests") for folder in found) == HOUSE
@@ -508,3 +579,7 @@ def test_the_lock_holds_no_cuda() -> None:
 def test_a_loose_pin_is_an_error(line: str) -> None:
     with pytest.raises(AssertionError, match="not an exact pin"):
         pins([line])
+
+
+if __name__ == "__main__":
+    print(house())
