@@ -84,7 +84,7 @@ def list_(
     """List the studies of a folder with their questions and variants."""
     files = sorted(folder.glob("*.yaml"))
     if not files:
-        raise InputError(f"{folder}: no studies (*.yaml) here")
+        raise InputError(f"{folder}: no studies (*.yaml) here; `rhmc study copy NAME` writes one of this package")
     found = [one for file in files if (one := _listed(file))]
     if as_json:
         say_json(found)
@@ -105,6 +105,22 @@ def _listed(file: Path) -> dict[str, Any] | None:
     fault = "" if question else str(faults[0]) if faults else "no question"
     variants = list(nodes["variants"].children) if "variants" in nodes else []
     return {"study": str(file), "question": question, "variants": variants, "fault": fault}
+
+
+@app.command("copy")
+def copy_shipped(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Of a study of this package, such as coverage.")],
+    out: Annotated[Path, typer.Option(help="Folder; made if it is not there.")] = Path("studies"),
+) -> None:
+    """Write a study of this package into a folder, with what it includes: where there is no checkout."""
+    from pipelines.specs.shipped import copy
+    from pipelines.workspace.work_folder import StoreError
+
+    try:
+        for path in copy(name, out):
+            say(str(path))
+    except StoreError as error:
+        raise InputError(str(error)) from error
 
 
 @app.command("export")

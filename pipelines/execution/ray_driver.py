@@ -4,7 +4,7 @@ import logging
 import os
 from collections import defaultdict, deque
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import chdir, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,7 @@ from pipelines.execution.ray_settings import OWN_NODE, RAY_SETTINGS, set_up_ray
 from pipelines.execution.trainable import RunTrainable
 from pipelines.workspace.work_folder import StoreError, one_line
 
+INSTALLED = Path(__file__).parents[2]  # what this project's packages are imported from
 HERE = "Ray cannot be used, on this machine"  # how an error begins that Ray met while it started
 QUIET: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.CRITICAL}
 
@@ -62,11 +63,15 @@ def ray_session(concurrent: int, cpus: int = 1, name: str = "", home: Path | Non
         yield [outline(concurrent, cpus), *exposed(), *(survey(home) if home else [])] if address() else []
 
 
+# Ray puts the folder that it is started in before all else that its workers import from. A person may have a folder
+# `pipelines` there, so it is started where this project is installed.
+
+
 @contextmanager
 def _joined(where: str) -> Iterator[None]:
     knock(where)
     read_again()
-    with _explained(f"Ray cannot be used, the cluster at RAY_ADDRESS={where}"):
+    with _explained(f"Ray cannot be used, the cluster at RAY_ADDRESS={where}"), chdir(INSTALLED):
         ray.init(address=where, runtime_env=travelling(RAY_SETTINGS), **QUIET)
     try:
         head = ray.get_runtime_context().gcs_address
@@ -81,7 +86,7 @@ def _joined(where: str) -> Iterator[None]:
 def _started(cpus: int, name: str) -> Iterator[None]:
     allow_files(cpus)
     with private_folder(name or str(os.getpid())) as folder, closed():
-        with _explained(HERE):
+        with _explained(HERE), chdir(INSTALLED):
             set_up_ray(OWN_NODE)
             ray.init(
                 address="local",

@@ -170,7 +170,10 @@ def test_a_faulty_study_is_refused_by_every_verb(rhmc: Rhmc, tmp_path: Path, ver
             ["study", "run", "studies/x.yaml", "--profile", "papr"],
             "--profile: 'papr' is not allowed; allowed: quick, paper; did you mean 'paper'?\n",
         ),
-        (["study", "list", "--folder", "nowhere"], "nowhere: no studies (*.yaml) here\n"),
+        (
+            ["study", "list", "--folder", "nowhere"],
+            "nowhere: no studies (*.yaml) here; `rhmc study copy NAME` writes one of this package\n",
+        ),
     ],
 )
 def test_what_cannot_be_used_is_one_line(rhmc: Rhmc, words: list[str], said: str) -> None:
