@@ -224,7 +224,7 @@ def test_every_verb_of_studies_takes_a_variant(rhmc: Rhmc, monkeypatch: pytest.M
     Path("studies/x.yaml").write_text(STUDY + "variants: {large: {algo: {hidden: 128}}}\n")
     names: list[str] = []
     monkeypatch.setattr("pipelines.execution.run.run_studies", lambda studies, home: names.append(studies[0].name) or 0)
-    for place in ("run.show_status", "export.export_study"):
+    for place in ("execution.run.show_status", "export.tables.export_study"):
         monkeypatch.setattr(f"pipelines.{place}", lambda study, *a, **k: names.append(study.name) or 0)
     for verb in (["study", "run"], ["study", "status"], ["export"]):
         rhmc(*verb, "studies/x.yaml", "--variant", "large")

@@ -186,7 +186,7 @@ def pythons() -> list[str]:
 def test_every_python_names_the_code_alike() -> None:
     """Of all modules of the project; only the versions that are installed can say."""
     program = (
-        "import sys, pathlib; sys.path.insert(0, 'pipelines'); import syntax\n"
+        "import sys, pathlib; sys.path.insert(0, 'pipelines/specs'); import syntax\n"
         "code = syntax.Code({name: pathlib.Path(name) for name in ('rhmc', 'pipelines', 'reports', 'tests')})\n"
         "print(*(f'{name} {code.digest(name)}' for name in sorted(code.sources)), sep='\\n')"
     )
@@ -243,16 +243,23 @@ EDITS = {
         {"qmix"},
         set(ENVS),
     ),
-    "what three methods share": (
-        "ppo.py",
+    "what two methods share": (
+        "algorithms/ppo.py",
         "import torch\n",
         "import torch\n\nEXTRA = 1\n",
-        {"mappo", "ippo", "hitmac"},
+        {"mappo", "ippo"},
+        set(ENVS),
+    ),
+    "what four methods share": (
+        "learning/returns.py",
+        "import torch\n",
+        "import torch\n\nEXTRA = 1\n",
+        {"mappo", "ippo", "hitmac", "coma"},
         set(ENVS),
     ),
     "a task": ("envs/navigation.py", "DT = 0.1", "DT = 0.2", set(ALGORITHMS), {"navigation"}),
     "a field of the trainer's settings": (
-        "trainer.py",
+        "training/trainer.py",
         '    device: str = "cpu"\n',
         '    device: str = "cpu"\n    extra: int = 0\n',
         set(ALGORITHMS),
@@ -295,15 +302,13 @@ def test_a_new_method_ages_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_a_module_in_another_folder_ages_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = copied(tmp_path, monkeypatch)
     before = names(monkeypatch)
-    (folder / "learning").mkdir()
-    (folder / "learning" / "__init__.py").write_text('"""How methods learn."""\n')
-    (folder / "learner.py").rename(folder / "learning" / "learner.py")
+    (folder / "deep").mkdir()
+    (folder / "deep" / "__init__.py").write_text('"""A room."""\n')
+    (folder / "learning" / "learner.py").rename(folder / "deep" / "learner.py")
     for file in folder.rglob("*.py"):
-        file.write_text(
-            file.read_text().replace("from rhmc.learning.learner import", "from rhmc.learning.learner import")
-        )
+        file.write_text(file.read_text().replace("from rhmc.learning.learner import", "from rhmc.deep.learner import"))
     assert names(monkeypatch) == before
-    assert "rhmc.learning.learner" in modules("qmix", "coverage")
+    assert "rhmc.deep.learner" in modules("qmix", "coverage")
 
 
 def test_the_library_and_packages_of_a_study_count(toy: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -61,7 +61,9 @@ def test_files_and_workers_are_utf8_as_well(tmp_path: Path) -> None:
     done = rhmc("fingerprint", str(out), env=ASCII)
     assert (done.returncode, done.stdout, done.stderr) == (0, b"", b"")
     assert len(out.read_text(encoding="utf-8")) == 13
-    code = "import os, sys; from pipelines import streams; streams.settle(); print(os.environ.get('PYTHONUTF8'))"
+    code = (
+        "import os, sys; from pipelines.workspace import streams; streams.settle(); print(os.environ.get('PYTHONUTF8'))"
+    )
     script = tmp_path / "program.py"
     script.write_text(code, encoding="utf-8")
     command = [sys.executable, str(script)]
