@@ -37,7 +37,7 @@ repro: $(READY) ## Train, track and report on the profile in params.yaml; an int
 	@rhmc profile > /dev/null
 	@dvc repro || { echo "Not finished. What is done is kept: \`make repro\` continues."; exit 1; }
 	@echo
-	@echo "Report:    reports/$$(rhmc profile)/index.html"
+	@echo "Report:    results/$$(rhmc profile)/index.html"
 	@echo "MLflow UI: run \`make ui\` and open the address that it prints"
 
 test: check ## Lint, types and every test
@@ -69,7 +69,7 @@ lock: $(READY) ## Write requirements.lock from .venv, after a deliberate change 
 clean: ## Remove .venv and caches; results stay
 	@rm -rf .venv .mypy_cache .pytest_cache .ruff_cache .hypothesis build *.egg-info
 	@find rhmc pipelines reports benchmarks tests -name __pycache__ -prune -exec rm -rf {} +
-	@echo "Removed .venv and the caches. Kept every result: work/ (runs, checkpoints) and reports/ (remove by hand)."
+	@echo "Removed .venv and the caches. Kept every result: work/ (runs, checkpoints) and results/ (remove by hand)."
 
 # torch comes first and alone, so that a build with CUDA is seen before its packages are fetched.
 $(READY): requirements.lock pyproject.toml

@@ -443,9 +443,9 @@ def command(study: str, profile: str) -> str:
     """What makes a study's numbers, and the report from them, again. The study is named as its table is."""
     report = f"rhmc report --profile {profile}"
     if study == THEOREM:
-        return f"rhmc theorem --out reports/{profile}/runs && {report}"
+        return f"rhmc theorem --out results/{profile}/runs && {report}"
     if study == YARDSTICKS:
-        return f"rhmc yardsticks all --profile {profile} --out reports/{profile}/runs && {report}"
+        return f"rhmc yardsticks all --profile {profile} --out results/{profile}/runs && {report}"
     file, _, variant = study.partition("@")
     which = f"studies/{file}.yaml --profile {profile}" + (f" --variant {variant}" if variant else "")
     return f"rhmc study run {which} && rhmc export {which} && {report}"

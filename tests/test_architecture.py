@@ -499,7 +499,7 @@ def test_every_study_is_in_the_pipeline(stages: dict) -> None:
     assert check == "rhmc profile"
     assert [command.split()[-3:] for command in commands] == [["${queue}", "--profile", "${profile}"]] * 2
     assert unmatched("dvc.yaml", {f"studies/{name}.yaml" for name in studies}, queue) == []
-    tables = {f"reports/${{profile}}/runs/{name}{kind}.parquet" for name in studies for kind in ("", ".runs")}
+    tables = {f"results/${{profile}}/runs/{name}{kind}.parquet" for name in studies for kind in ("", ".runs")}
     assert unmatched("dvc.yaml", tables, [next(iter(out)) for out in stage["outs"]]) == []
     assert "studies" in stage["deps"]  # the whole folder, and with it what a study includes
 

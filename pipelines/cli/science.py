@@ -81,7 +81,7 @@ def profile(
 
 
 def drawings(
-    out: Annotated[Path, typer.Option(help="Folder; made if it is not there.")] = Path("reports/quick/runs"),
+    out: Annotated[Path, typer.Option(help="Folder; made if it is not there.")] = Path("results/quick/runs"),
 ) -> None:
     """Write what Figures 1 to 5 and 8 show: RHMC's networks as they run, and states of both tasks."""
     from pipelines.export.drawings import export_drawings
@@ -95,10 +95,10 @@ def report(
     profile: Profile = "quick",
     study: Annotated[Path | None, typer.Option(metavar="FILE", help="Report on this study alone.")] = None,
     variant: Annotated[str | None, typer.Option(help="Of that study.")] = None,
-    runs: Annotated[Path | None, typer.Option(help="Exported tables; reports/<profile>/runs if not given.")] = None,
+    runs: Annotated[Path | None, typer.Option(help="Exported tables; results/<profile>/runs if not given.")] = None,
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder; reports/<profile>, with study/<name> after it for one study, if not given."),
+        typer.Option(help="Folder; results/<profile>, with study/<name> after it for one study, if not given."),
     ] = None,
 ) -> None:
     """Build figures, tables, claims and their page from the exported tables; or curves and comparison of one study."""

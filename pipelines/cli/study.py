@@ -203,7 +203,7 @@ def export(
     files: Files,
     profile: Profile = "quick",
     variant: Variant = None,
-    out: Annotated[Path | None, typer.Option(help="Folder; reports/<profile>/runs if not given.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder; results/<profile>/runs if not given.")] = None,
     overrides: Sets = None,
 ) -> None:
     """Write each study's results as one tidy table and a table of its runs, for the report."""
@@ -216,7 +216,7 @@ def export(
 
     code = DONE
     for study in studies:
-        code = max(code, export_study(study, out or Path("reports") / profile / "runs"))
+        code = max(code, export_study(study, out or Path("results") / profile / "runs"))
         if code == BAD:
             raise typer.Exit(BAD)
     words = ["rhmc", "report", *(["--study", str(files[0])] if len(files) == 1 else [])]

@@ -1,6 +1,6 @@
 """Published results: what the repository holds of a profile, results here in that form, and its runs trained anew.
 
-`reports/published/<profile>` has the finals and curves of a profile that is too quick to keep whole; of the paper
+`results/published/<profile>` has the finals and curves of a profile that is too quick to keep whole; of the paper
 profile the exported tables themselves are in the repository.
 """
 
@@ -21,7 +21,7 @@ from pipelines.workspace.process_pool import side_by_side
 from pipelines.workspace.work_folder import Home
 from rhmc.training.trainer import Trainer
 
-REPORTS = Path("reports")
+RESULTS = Path("results")
 NAME = "results"  # of the tables of a profile in small form
 CURVE, FINALS = "eval/return", "final/"
 RUNS = pa.schema([field for field in METRICS if field.name in {"study", "arm", "seed", "run"}]).append(
@@ -32,8 +32,8 @@ CONFIG = pa.field("config", pa.string())  # the spec as canonical JSON
 
 def folder(profile: str) -> Path:
     """Where the repository holds the results of a profile."""
-    small = REPORTS / "published" / profile
-    return small if small.is_dir() else REPORTS / profile / "runs"
+    small = RESULTS / "published" / profile
+    return small if small.is_dir() else RESULTS / profile / "runs"
 
 
 def publish(values: pd.DataFrame, runs: pd.DataFrame, profile: str) -> Path:
@@ -50,7 +50,7 @@ def publish(values: pd.DataFrame, runs: pd.DataFrame, profile: str) -> Path:
     left = runs[runs["status"] != "finished"]
     if len(left):
         raise InputError(f"{len(left)} of {len(runs)} runs are not finished; only whole results are published")
-    out = REPORTS / "published" / profile
+    out = RESULTS / "published" / profile
     kept = values[(values["metric"] == CURVE) | values["metric"].str.startswith(FINALS)]
     for name, schema, table in ((NAME, METRICS, kept), (f"{NAME}.runs", RUNS.append(CONFIG), runs)):
         rows = table[schema.names].sort_values(schema.names[:-1]).itertuples(index=False, name=None)

@@ -21,7 +21,7 @@ from pipelines.workspace.provenance import Host
 from reports.data.escaping import code, markdown, prose
 
 LISTED = 25  # arms that a description names: MLflow keeps 8,000 characters of one
-RESULTS = (":(top,exclude)dvc.lock", ":(top,exclude,glob)reports/*/**")  # of the pipeline, as git's pathspecs
+RESULTS = (":(top,exclude)dvc.lock", ":(top,exclude,glob)results/**")  # of the pipeline, as git's pathspecs
 PATIENCE = 10.0  # seconds for git to answer
 KIND = "algo.kind"  # which is what the param `method` says
 

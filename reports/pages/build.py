@@ -155,10 +155,10 @@ def main(argv: Sequence[str] | None = None, shown: Callable[[str], str] = str) -
     )
     parser.add_argument("--profile", default="quick", help="profile that made the runs (default: quick)")
     parser.add_argument("--study", help="report on this study alone")
-    parser.add_argument("--runs", type=Path, help="folder of the tables (default: reports/PROFILE/runs)")
-    parser.add_argument("--out", type=Path, help="folder of the report (default: reports/PROFILE[/study/STUDY])")
+    parser.add_argument("--runs", type=Path, help="folder of the tables (default: results/PROFILE/runs)")
+    parser.add_argument("--out", type=Path, help="folder of the report (default: results/PROFILE[/study/STUDY])")
     args = parser.parse_args(argv)
-    home = Path("reports") / args.profile
+    home = Path("results") / args.profile
     out = args.out or (home / "study" / args.study if args.study else home)
     try:
         built = build(args.runs or home / "runs", out, args.profile, args.study)

@@ -311,7 +311,7 @@ def test_export_goes_to_the_folder_of_the_profile(rhmc: Rhmc, monkeypatch: pytes
     assert rhmc("export", "studies/x.yaml", "--out", "there") == (1, "", f"{report} --runs there\n")
     monkeypatch.setattr("pipelines.export.tables.export_study", lambda study, out: 2)
     assert rhmc("export", "studies/x.yaml") == (2, "", "")
-    assert calls == [("x", Path("reports/paper/runs")), ("x", Path("there"))]
+    assert calls == [("x", Path("results/paper/runs")), ("x", Path("there"))]
 
 
 def test_export_of_several_studies(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> None:

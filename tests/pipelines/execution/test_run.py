@@ -689,7 +689,7 @@ def test_a_commit_is_dirty_by_code_and_not_by_results(tmp_path: Path) -> None:
         names = ("-c", "user.name=n", "-c", "user.email=e")
         subprocess.run(["git", *names, *words], cwd=tmp_path, check=True, capture_output=True)
 
-    files = [tmp_path / name for name in ("rhmc/a.py", "reports/pages/page.py", "reports/paper/claims.md", "dvc.lock")]
+    files = [tmp_path / name for name in ("rhmc/a.py", "reports/pages/page.py", "results/paper/claims.md", "dvc.lock")]
     for file in files:
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text("one\n")

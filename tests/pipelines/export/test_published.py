@@ -70,7 +70,7 @@ def edited(source: Path, out: Path, change: "pd.Series[float] | float", arm: str
 def test_what_is_published_is_small_and_verified(exported: Path) -> None:
     values, runs = read(exported)
     assert verify("--runs", exported).code == 2, "nothing is published yet"
-    assert publish(values, runs, "quick") == folder("quick") == Path("reports/published/quick")
+    assert publish(values, runs, "quick") == folder("quick") == Path("results/published/quick")
     small, planned = read(folder("quick"))
     assert {name.partition("/")[0] for name in small["metric"]} == {"eval", "final"}
     assert len(small) < len(values)
@@ -112,7 +112,7 @@ def test_unfinished_results_are_not_published(tmp_path: Path) -> None:
     export(STUDY, tmp_path / "half", runs=3)
     with pytest.raises(InputError, match=r"1 of 4 runs are not finished"):
         publish(*read(tmp_path / "half"), "quick")
-    assert not Path("reports").exists()
+    assert not Path("results").exists()
 
 
 def test_runs_trained_anew(exported: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ RESULTS = re.compile(r"^\| Arm \|.*\n(?:\|.*\n)+", re.MULTILINE)
 
 
 def test_its_tables_are_tables_of_the_report() -> None:
-    written = {path.read_text().strip() for path in (ROOT / "reports" / "paper" / "tables").glob("final_*.md")}
+    written = {path.read_text().strip() for path in (ROOT / "results" / "paper" / "tables").glob("final_*.md")}
     shown = [found.strip() for found in RESULTS.findall(README)]
     assert len(shown) >= 2
     assert [table.splitlines()[2] for table in shown if table not in written] == []
