@@ -18,6 +18,8 @@ SEED ?= 0
 FITS := -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))'
 PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do $$p $(FITS) 2>/dev/null && echo $$p && break; done)
 READY := .venv/.ready
+# A file of tests goes to one process, which makes its fixtures once; `tests/conftest.py` has the order.
+SHARED := --dist loadfile --no-loadscope-reorder
 
 # The environment's own programs first: `rhmc` in a DVC stage is this project's.
 export PATH := $(CURDIR)/.venv/bin:$(PATH)
@@ -26,22 +28,32 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_NO_INPUT := 1
 unexport PYTHONPATH
 
-.PHONY: help setup repro test check bench soak report ui lock clean
+.PHONY: help setup repro test deep check bench soak report ui lock clean
 
 help: ## What there is to make
 	@grep -hE '^[a-z]+:.*## ' Makefile | sed -E 's/^([a-z]+):[^#]*## /  make \1\t/' | expand -t 14
 
 setup: $(READY) ## The environment in .venv, exactly as in requirements.lock
 
+# The page is no out of the pipeline (dvc.yaml says why): it is made where it is missing, or older than what it is of.
+# Results that differ from the published ones are said in the last line and are no failure: the run is done.
 repro: $(READY) ## Train, track and report on the profile in params.yaml; an interrupted one continues
 	@rhmc profile > /dev/null
 	@dvc repro || { echo "Not finished. What is done is kept: \`make repro\` continues."; exit 1; }
+	@profile=$$(rhmc profile); out="results/$$profile"; \
+	  [[ -e "$$out/index.html" && -z "$$(find "$$out/runs" -newer "$$out/index.html")" ]] || \
+	  rhmc report --profile "$$profile"
 	@echo
 	@echo "Report:    results/$$(rhmc profile)/index.html"
 	@echo "MLflow UI: run \`make ui\` and open the address that it prints"
+	@profile=$$(rhmc profile); test ! -d "results/published/$$profile" || \
+	  rhmc verify --runs "results/$$profile/runs" --profile "$$profile" || test $$? -eq 1
 
 test: check ## Lint, types and every test
-	@python -m pytest -n $(JOBS)
+	@python -m pytest -n $(JOBS) $(SHARED)
+
+deep: $(READY) ## Every test, with many more random kills and examples: before a release
+	@DEEP=1 python -m pytest -n $(JOBS) $(SHARED)
 
 check: $(READY) ## Lint and types only
 	@ruff check --quiet .

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from reports.data.frame import POINTS, RUNS
+from reports.data.frame import OWN, PLACE, POINTS, RUNS
 from reports.pages.build import build
 
 STUDIES = ("ablation", "coverage", "reach", "scaling")
@@ -39,9 +39,9 @@ def tables(study: str, seeds: int, points: int, rng: np.random.Generator) -> tup
             rows.append((*place, STEPS, "final/return", float(level)))
             env = {"kind": "coverage", "preset": "flat", "agents": agents, "targets": 5}
             config = json.dumps({"env": env, "trainer": {"steps": STEPS}, "seed": seed, "arm": name})
-            made = ("finished", "rhmc", "coverage", "paper", config, "0123456789ab", "c0ffee", "How fast?", 600.0)
-            plan.append((*place, *made))
-    return pd.DataFrame(rows, columns=list(POINTS)), pd.DataFrame(plan, columns=list(RUNS))
+            made = ("finished", "rhmc", "coverage", "paper", config, "0123456789ab", "How fast?", "c0ffee", 600.0)
+            plan.append((*place, *made, "", "", ""))
+    return pd.DataFrame(rows, columns=list(POINTS)), pd.DataFrame(plan, columns=[*RUNS, *OWN])
 
 
 def write(folder: Path, seeds: int, points: int) -> tuple[int, int]:
@@ -50,7 +50,8 @@ def write(folder: Path, seeds: int, points: int) -> tuple[int, int]:
     for study in STUDIES:
         values, plan = tables(study, seeds, points, rng)
         values.to_parquet(folder / f"{study}.parquet", index=False)
-        plan.to_parquet(folder / f"{study}.runs.parquet", index=False)
+        plan[list(RUNS)].to_parquet(folder / f"{study}.runs.parquet", index=False)
+        plan[[*PLACE, *OWN]].to_parquet(folder / f"{study}.made.parquet", index=False)
         runs, rows = runs + len(plan), rows + len(values)
     return runs, rows
 

@@ -1,8 +1,10 @@
-"""Settings under which torch computes the same bytes on every x86-64 processor with AVX2.
+"""Settings under which torch computes the same bytes on every x86-64 processor with AVX2 and FMA.
 
 torch and the libraries below it choose instructions by the processor that they find, and other instructions round
-otherwise. Here they are told to use those that all such processors have. They read it at their first operation, so
-importing `rhmc` before anything is computed is enough. What was compared, and where: `docs/reproducibility.md`.
+otherwise. Here they are told to use those that all such processors have; products of layers are those of
+`rhmc.networks.linear`, which need no setting. `Tensor.sqrt` is left out of `rhmc`: MKL's differs all the same. They
+read the settings at their first operation, so importing `rhmc` before anything is computed is enough. What was
+compared, and where: `docs/reproducibility.md`.
 """
 
 import os
@@ -11,8 +13,8 @@ from pathlib import Path
 
 SETTINGS = {
     "ATEN_CPU_CAPABILITY": "avx2",  # torch's own kernels: exp, tanh, softmax
-    "MKL_CBWR": "AVX2",  # products of matrices
-    "ONEDNN_MAX_CPU_ISA": "AVX2",
+    "MKL_CBWR": "COMPATIBLE",  # functions of arrays, and products of matrices outside `rhmc.networks.linear`
+    "ONEDNN_DEFAULT_FPMATH_MODE": "STRICT",  # products of `rhmc.networks.linear`: no numbers of fewer bits
 }
 CAPABILITY = "AVX2"  # what torch then says of itself
 CPUINFO = Path("/proc/cpuinfo")
@@ -28,7 +30,7 @@ def possible() -> bool:
     """Whether this processor has the instructions; results of another kind are its own."""
     if platform.machine().lower() not in {"x86_64", "amd64"}:
         return False
-    return not CPUINFO.exists() or "avx2" in CPUINFO.read_text(encoding="utf-8").split()
+    return not CPUINFO.exists() or {"avx2", "fma"} <= set(CPUINFO.read_text(encoding="utf-8").split())
 
 
 def active() -> bool:

@@ -1,4 +1,4 @@
-"""Work folders for tests, one Ray for all of them, and one torch thread.
+"""Work folders for tests, one Ray for all of them, one torch thread, and the longest files first.
 
 Results of larger layers depend on the number of threads.
 """
@@ -14,6 +14,7 @@ import torch
 torch.set_num_threads(1)
 os.environ.pop("MLFLOW_TRACKING_URI", None)
 os.environ.pop("RAY_ADDRESS", None)
+os.environ.setdefault("RAY_worker_niceness", "0")  # else whatever else runs, such as other tests, starves them
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -25,10 +26,19 @@ ROOMS = {Path(__file__).parent / name for name in ("pipelines", "robustness")}
 KNOWN = [  # warnings of pinned packages about each other
     "ignore:The ``noload`` loader strategy is deprecated:DeprecationWarning",  # MLflow's use of SQLAlchemy 2.1
 ]
+LONGEST = [  # files that take most processor time, so that no process of `pytest -n` has one of them left at the end
+    *("conformance/test_algorithms", "robustness/test_cluster", "tuning/test_search", "robustness/test_interrupt"),
+    *("bundles/test_bundle", "robustness/test_faults", "robustness/test_killed", "execution/test_run"),
+    *("execution/test_private_node", "tuning/test_ray_workers", "workspace/test_addresses"),
+    *("workspace/test_work_folder", "robustness/test_malformed", "reports/test_robust", "pages/test_build"),
+    "reports/test_hostile",
+]
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Let the tests of `ROOMS` pass over what is `KNOWN`; every other warning stays an error."""
+    """Put the `LONGEST` first, all else stays in its order; tests of `ROOMS` pass over warnings that are `KNOWN`."""
+    places = {name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: places.get(f"{item.path.parent.name}/{item.path.stem}", len(places)))
     for item in items:
         if ROOMS & set(item.path.parents):
             for warning in KNOWN:

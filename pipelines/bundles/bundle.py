@@ -2,8 +2,8 @@
 
 A bundle holds `bundle.json` (what it is), `runs.parquet` (a row per run), `points.parquet` (a row per run, step and
 metric, `time/` included), `policies/<key>.pt` of finished runs and `checkpoints/<key>/` of those under way. One of
-values only has no policies and no runs under way. What a bundle may hold is checked in `bundle_files` (names and
-sizes), `bundle_rows` (the study, its runs and their values) and `bundle_states` (policies and checkpoints).
+values only has no policies and no runs under way. What a bundle may hold is checked in `bundles.files` (names and
+sizes), `bundles.rows` (the study, its runs and their values) and `bundles.states` (policies and checkpoints).
 """
 
 import hashlib

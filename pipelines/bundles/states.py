@@ -11,6 +11,7 @@ import torch
 
 from pipelines.bundles.files import BundleError, Files
 from pipelines.bundles.rows import Entry, metric_fault, on_grid, shown
+from pipelines.execution.finite import astray
 from pipelines.specs.document import show
 from pipelines.tracking.plan import resolved_yaml
 from pipelines.tracking.policy import CONFIG, FILE, Actor, Saved, load
@@ -163,17 +164,6 @@ def _check_fit(name: str, file: Path, entry: Entry) -> None:
         raise BundleError(f"{name}: {one_line(error).removeprefix(f'{file}: ')}") from error
     except Exception as error:  # a state of other code fails anywhere in ours
         raise BundleError(f"{name}: does not fit its run: {one_line(error)}; --values-only leaves it behind") from error
-    if entry.finished and (astray := next(_astray(saved.algorithm), "")):
-        raise BundleError(f"{name}: {astray}: a weight is not a finite number")
-
-
-def _astray(state: Any, place: str = "") -> Iterator[str]:
-    """Where floats that are not finite lie."""
-    if isinstance(state, dict):
-        for key, value in state.items():
-            yield from _astray(value, f"{place}.{key}" if place else str(key))
-    elif isinstance(state, list | tuple):
-        for value in state:
-            yield from _astray(value, place)
-    elif isinstance(state, torch.Tensor) and state.is_floating_point() and not bool(state.isfinite().all()):
-        yield show(place)
+    if entry.finished:
+        for place, _ in astray(saved.algorithm):
+            raise BundleError(f"{name}: {show(place)}: a weight is not a finite number")

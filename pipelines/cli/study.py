@@ -206,7 +206,7 @@ def export(
     out: Annotated[Path | None, typer.Option(help="Folder; results/<profile>/runs if not given.")] = None,
     overrides: Sets = None,
 ) -> None:
-    """Write each study's results as one tidy table and a table of its runs, for the report."""
+    """Write each study's results as one tidy table, with tables of its runs and how they were made, for the report."""
     studies = load_studies(files, profile, overrides, variant)
     from pipelines.export.tables import export_study
     from pipelines.tracking.plan import given_twice

@@ -32,7 +32,7 @@ def verify(
 
     Exit code 1 where an arm is missing, has other settings, or is not shown to be equivalent.
     """
-    from pipelines.export.published import folder
+    from pipelines.export.published import folder, trained
     from pipelines.export.published import retrain as train
     from reports.analyses.equivalence import compare, read
     from reports.data.frame import TableError
@@ -43,6 +43,8 @@ def verify(
             return
         wanted, theirs = read(published or folder(profile))
         _same_profile(theirs, profile, published or folder(profile))
+        if runs is None:
+            wanted, theirs = trained(wanted, theirs)
         if retrain:
             compared = _again(list(train(theirs, retrain, seed, jobs)), wanted, margin)
         else:
@@ -74,10 +76,9 @@ def _here(runs: Path | None, profile: str, studies: Sequence[str] | None) -> "tu
 
 
 def _publish(values: "pd.DataFrame", runs: "pd.DataFrame", profile: str) -> Path:
-    from pipelines.export.published import publish
+    from pipelines.export.published import publish, trained
 
-    trained = ~runs["algorithm"].isin(["scripted", "theorem"])
-    return publish(values[values["study"].isin(runs[trained]["study"])], runs[trained], profile)
+    return publish(*trained(values, runs), profile)
 
 
 def _same_profile(runs: "pd.DataFrame", profile: str, where: Path) -> None:

@@ -128,7 +128,7 @@ def everything(
     profile: Profile = "quick",
     jobs: Annotated[int, typer.Option(min=1, max=JOBS, help="Banks at a time.")] = 2,
 ) -> None:
-    """Every task, policy and bound that the report uses: yardsticks.parquet and yardsticks.runs.parquet.
+    """Every task, policy and bound that the report uses: yardsticks.parquet, with .runs.parquet and .made.parquet.
 
     The profile decides the number of episodes. The files are written at the end, after minutes.
     """

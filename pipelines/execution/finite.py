@@ -40,9 +40,15 @@ def check(point: Metrics, state: State) -> None:
     for name, value in point.items():
         if not math.isfinite(value):
             raise _diverged(name, value, point)
-    for name, tensor in _tensors(without_replay(state)):
+    for name, tensor in astray(without_replay(state)):
+        raise _diverged(name, float(tensor[~torch.isfinite(tensor)][0]), point)
+
+
+def astray(state: Any) -> Iterator[tuple[str, Tensor]]:
+    """The tensors of a state that hold a value that is not finite and may not, by dotted path."""
+    for name, tensor in _tensors(state):
         if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
-            raise _diverged(name, float(tensor[~torch.isfinite(tensor)][0]), point)
+            yield name, tensor
 
 
 def _diverged(name: str, value: float, point: Metrics) -> DivergedError:

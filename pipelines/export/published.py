@@ -58,6 +58,14 @@ def publish(values: pd.DataFrame, runs: pd.DataFrame, profile: str) -> Path:
     return out
 
 
+def trained(values: pd.DataFrame, runs: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Values and runs of trainings alone, without yardsticks and Theorem 1, of which no log knows."""
+    if "algorithm" not in runs:  # results in small form are of trainings
+        return values, runs
+    mine = runs[~runs["algorithm"].isin(["scripted", "theorem"])]
+    return values[values["study"].isin(mine["study"])], mine
+
+
 def export_log(studies: Sequence[str], profile: str, home: Path, out: Path) -> None:
     """Write what the log holds of these studies as exported tables.
 

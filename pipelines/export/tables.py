@@ -1,6 +1,7 @@
-"""From the log to two small files per study: all that the reports read.
+"""From the log to three small files per study: all that the reports read.
 
-The files are canonical: the same log gives the same bytes (sorted rows, no clock, no names that the log made up).
+The files are canonical: the same log gives the same bytes (sorted rows, no clock, no names that the log made up). Two
+of them are the same bytes wherever results are equal; how and where each run was made has a file of its own.
 """
 
 import sys
@@ -16,44 +17,36 @@ from pipelines.tracking.plan import Item, items, study_card
 from pipelines.tracking.tracker import Recorded, Row, Tracker
 from pipelines.workspace.errors import InputError, visible
 from pipelines.workspace.files import regular
-from pipelines.workspace.provenance import Host
 from pipelines.workspace.work_folder import Home, StoreError, lacks_memory, reason, whole, work_folder
 
-METRICS = pa.schema(
+PLACE = [("study", pa.string()), ("arm", pa.string()), ("seed", pa.int64()), ("run", pa.string())]  # run: spec id
+METRICS = pa.schema([*PLACE, ("step", pa.int64()), ("metric", pa.string()), ("value", pa.float64())])
+RUNS = pa.schema(  # the planned runs: nothing here depends on commit, machine or time
     [
-        ("study", pa.string()),
-        ("arm", pa.string()),
-        ("seed", pa.int64()),
-        ("run", pa.string()),  # spec id
-        ("step", pa.int64()),
-        ("metric", pa.string()),
-        ("value", pa.float64()),
-    ]
-)
-RUNS = pa.schema(
-    [
-        ("study", pa.string()),
-        ("arm", pa.string()),
-        ("seed", pa.int64()),
-        ("run", pa.string()),
+        *PLACE,
         ("status", pa.string()),  # finished, failed, partial or missing
         ("algorithm", pa.string()),
         ("task", pa.string()),
         ("profile", pa.string()),
         ("config", pa.string()),  # the spec as canonical JSON
-        ("fingerprint", pa.string()),
-        ("commit", pa.string()),
+        ("fingerprint", pa.string()),  # code id
         ("question", pa.string()),
-        ("seconds", pa.float64()),  # spent training
     ]
 )
-EXPORTED = pa.schema(  # of a study: what started its runs, and from which code those were adopted that older code made
-    [*RUNS, ("machine", pa.string()), ("versions", pa.string()), ("adopted", pa.string())]
+MADE = pa.schema(  # the runs that are there: how and where each was made
+    [
+        *PLACE,
+        ("commit", pa.string()),
+        ("seconds", pa.float64()),  # spent training
+        ("machine", pa.string()),
+        ("versions", pa.string()),
+        ("adopted", pa.string()),  # from which code, where older code made it
+    ]
 )
 
 
 def export_study(study: Study, out: Path, home: Path | None = None) -> int:
-    """Write `<out>/<study>.parquet` (schema `METRICS`) and `<out>/<study>.runs.parquet` (schema `EXPORTED`).
+    """Write `<study>.parquet` (schema `METRICS`), `<study>.runs.parquet` (`RUNS`), `<study>.made.parquet` (`MADE`).
 
     Only runs of the present plan and code are taken; `time/` metrics stay behind, but for the seconds of a run.
 
@@ -84,30 +77,35 @@ def export_study(study: Study, out: Path, home: Path | None = None) -> int:
 
 
 def write_tables(study: Study, plan: list[Item], tracker: Tracker | None, out: Path) -> int:
-    """Write both files and return how many planned runs are not finished."""
+    """Write the three files and return how many planned runs are not finished."""
     found = {(run.arm, run.key): run for run in tracker.recorded()} if tracker else {}
     there = [(item, found.get((item.card.arm, item.key))) for item in plan]
     refs = [run.ref for _, run in there if run]
     by_ref: dict[str, list[Row]] = {ref: [] for ref in refs}
     for row in tracker.rows(refs) if tracker else []:
         by_ref[row.ref].append(row)
-    values, runs = [], []
+    values, runs, made = [], [], []
     for item, run in there:
         rows = by_ref[run.ref] if run else []
         place = (study.name, item.card.arm, item.card.seed, item.card.spec_id)
         values += [(*place, r.step, r.metric, r.value) for r in rows if not r.metric.startswith("time/")]
-        runs.append((*place, *_about(study, item, run, rows)))
+        runs.append((*place, *_about(study, item, run)))
+        made += [(*place, *_made(run, rows))] if run else []
     write_parquet(out / f"{study.name}.parquet", METRICS, sorted(values, key=lambda row: row[:6]))
-    write_parquet(out / f"{study.name}.runs.parquet", EXPORTED, sorted(runs, key=lambda row: row[:4]))
+    write_parquet(out / f"{study.name}.runs.parquet", RUNS, sorted(runs, key=lambda row: row[:4]))
+    write_parquet(out / f"{study.name}.made.parquet", MADE, sorted(made, key=lambda row: row[:4]))
     return sum(1 for _, run in there if run is None or run.status != "finished")
 
 
-def _about(study: Study, item: Item, run: Recorded | None, rows: list[Row]) -> tuple[str | float, ...]:
+def _about(study: Study, item: Item, run: Recorded | None) -> tuple[str, ...]:
     status = "missing" if run is None else run.status if run.status in ("finished", "failed") else "partial"
+    names = (status, item.card.algorithm, item.card.task, study.profile, item.spec.canonical(), item.card.fingerprint)
+    return (*names, study.question)
+
+
+def _made(run: Recorded, rows: list[Row]) -> tuple[str | float, ...]:
     seconds = max((row.value for row in rows if row.metric == "time/seconds"), default=0.0)
-    card, commit = item.card, run.commit if run else ""
-    names = (status, card.algorithm, card.task, study.profile, item.spec.canonical(), card.fingerprint, commit)
-    return (*names, study.question, seconds, *(run.host if run else Host()), run.adopted if run else "")
+    return (run.commit, seconds, *run.host, run.adopted)
 
 
 def write_parquet(path: Path, schema: pa.Schema, rows: list[tuple[object, ...]]) -> None:
@@ -123,7 +121,7 @@ def write_parquet(path: Path, schema: pa.Schema, rows: list[tuple[object, ...]])
 
 
 def read_parquet(path: Path, schema: pa.Schema, what: str) -> list[dict[str, Any]]:
-    """The rows of a table that `write_parquet` wrote; none without a file.
+    """The rows of a table that `write_parquet` wrote; none without a file. Columns that an earlier form had are left.
 
     Args:
         path: the file.
@@ -143,6 +141,6 @@ def read_parquet(path: Path, schema: pa.Schema, what: str) -> list[dict[str, Any
         if lacks_memory(error) or getattr(error, "errno", None):  # which says nothing of the table
             raise StoreError(f"{path}: cannot be read now: {reason(error)}") from error
         raise InputError(f"{path}: not a readable table; move it away") from error
-    if table.schema.names != schema.names:
+    if not set(schema.names) <= set(table.schema.names):
         raise InputError(f"{path}: a table, but not one of {what}; move it away")
-    return table.to_pylist()
+    return table.select(schema.names).to_pylist()

@@ -8,10 +8,11 @@ from typing import Any, NamedTuple
 
 import pyarrow as pa
 
-from pipelines.export.tables import METRICS, RUNS, read_parquet, write_parquet
+from pipelines.export.tables import MADE, METRICS, RUNS, read_parquet, write_parquet
 from pipelines.specs.identity import fingerprint
 from pipelines.tracking.plan import commit
 from pipelines.workspace.process_pool import side_by_side
+from pipelines.workspace.provenance import host
 from rhmc.envs import EnvConfig
 from rhmc.envs.coverage import Config as Coverage
 from rhmc.envs.navigation import Config as Navigation
@@ -97,10 +98,11 @@ def _play(bank: Bank) -> Scores:
 
 
 class Tables(NamedTuple):
-    """The rows of both files."""
+    """The rows of the files."""
 
     values: list[Row]
     runs: list[Row]
+    made: list[Row]
 
 
 def present(out: Path) -> Tables:
@@ -109,12 +111,12 @@ def present(out: Path) -> Tables:
     Raises:
         InputError: there is another file under one of the names.
     """
-    values_file, runs_file = _files(out)
-    return Tables(read_parquet(values_file, METRICS, STUDY), read_parquet(runs_file, RUNS, STUDY))
+    forms = zip(_files(out), (METRICS, RUNS, MADE), strict=True)
+    return Tables(*(read_parquet(file, schema, STUDY) for file, schema in forms))
 
 
 def export_yardsticks(found: Iterable[Scored], profile: str, out: Path) -> Path:
-    """Write `yardsticks.parquet` and `yardsticks.runs.parquet` in a folder, or bring them up to date.
+    """Write `yardsticks.parquet`, `.runs.parquet` and `.made.parquet` in a folder, or bring them up to date.
 
     Rows of other tasks and other policies stay if the present code made them. A bound without a return (the reward is
     local) is left out: no figure could place it.
@@ -131,25 +133,33 @@ def export_yardsticks(found: Iterable[Scored], profile: str, out: Path) -> Path:
         InputError: there is another file under one of the names.
         StoreError: the folder cannot be written to.
     """
-    before, current = present(out), (fingerprint(), profile, commit())
+    before, code, here = present(out), fingerprint(), _here()
     placed = [(bank, name, score) for bank, scores in found for name, score in scores.items() if "return" in score]
-    runs = [_run(bank, name, *current) for bank, name, _ in placed]
+    runs = [_run(bank, name, code, profile) for bank, name, _ in placed]
     values = [row for run, (_, _, score) in zip(runs, placed, strict=True) for row in _values(run, score)]
+    made = [run | here for run in runs]
     new = {_place(run) for run in runs}
-    kept = [r for r in before.runs if (r["fingerprint"], r["profile"]) == current[:2] and _place(r) not in new]
+    kept = [r for r in before.runs if (r["fingerprint"], r["profile"]) == (code, profile) and _place(r) not in new]
     ids = {run["run"] for run in kept}
     values += [row for row in before.values if row["run"] in ids]
-    values_file, runs_file = _files(out)
+    made += [row for row in before.made if row["run"] in ids]
+    values_file, runs_file, made_file = _files(out)
     write_parquet(values_file, METRICS, _rows(METRICS, values))
     write_parquet(runs_file, RUNS, _rows(RUNS, runs + kept))
+    write_parquet(made_file, MADE, _rows(MADE, made))
     return values_file
 
 
-def _files(out: Path) -> tuple[Path, Path]:
-    return out / f"{STUDY}.parquet", out / f"{STUDY}.runs.parquet"
+def _files(out: Path) -> tuple[Path, ...]:
+    return tuple(out / f"{STUDY}{kind}.parquet" for kind in ("", ".runs", ".made"))
 
 
-def _run(bank: Bank, name: str, code: str, profile: str, commit: str) -> Row:
+def _here() -> Row:
+    """How and where scores of today are made; the time of a single policy is not taken."""
+    return {"commit": commit(), "seconds": 0.0, "adopted": ""} | host()._asdict()
+
+
+def _run(bank: Bank, name: str, code: str, profile: str) -> Row:
     env = bank.env.model_dump(mode="json")
     config = {"env": env, "episodes": bank.episodes, "bank": bank.seed, "policy": name}
     text = json.dumps(config, sort_keys=True, separators=(",", ":"))
@@ -164,9 +174,7 @@ def _run(bank: Bank, name: str, code: str, profile: str, commit: str) -> Row:
         "profile": profile,
         "config": text,
         "fingerprint": code,
-        "commit": commit,
         "question": QUESTION,
-        "seconds": 0.0,
     }
 
 

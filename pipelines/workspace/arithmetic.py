@@ -8,17 +8,20 @@ from collections.abc import Callable, Iterable, Iterator
 
 import torch
 from torch import Generator, Tensor, nn
-from torch.nn.functional import elu, huber_loss, linear, log_softmax, softmax, softplus
+from torch.nn.functional import elu, huber_loss, log_softmax, softmax, softplus
+
+from rhmc.networks.linear import Linear, linear
 
 DIGITS = 12
 SIZES = ((2560, 4, 64), (2560, 10, 64), (2560, 64, 64), (512, 128, 64), (512, 330, 64), (512, 64, 3), (7, 5, 3))
 PUBLISHED = {  # under `rhmc.portable`; where this was seen: docs/reproducibility.md
     "random numbers": "535b27ddf716",
-    "elementwise": "ffb1e7e35856",
+    "elementwise": "537a219d9787",
     "transcendental": "55e38ba90ed2",
     "reductions": "58d67920e16c",
-    "products of matrices": "c082b49a4f19",
-    "training": "70a4fa805524",
+    "layers": "5b34b766ca95",
+    "products of matrices": "f20a37082c1d",
+    "training": "3a8ba5311817",
 }
 
 
@@ -55,7 +58,7 @@ def _random(rng: Generator) -> Iterator[Tensor]:
 
 def _elementwise(rng: Generator) -> Iterator[Tensor]:
     a = _uniform(rng, 2560, 64)
-    yield from (a + a * 3, a.relu(), (a / 3).abs().sqrt(), torch.lerp(a, a * 2, 0.3), a.clamp(-0.5, 0.5), a.fmod(0.3))
+    yield from (a + a * 3, a.relu(), (a / 3).abs().rsqrt(), torch.lerp(a, a * 2, 0.3), a.clamp(-0.5, 0.5), a.fmod(0.3))
 
 
 def _transcendental(rng: Generator) -> Iterator[Tensor]:
@@ -70,11 +73,19 @@ def _reductions(rng: Generator) -> Iterator[Tensor]:
     yield from (a.view(512, 5, 64).mean(1), a.view(512, 5, 64).amax(1), a.argmax(1), a.logsumexp(1))
 
 
+def _layers(rng: Generator) -> Iterator[Tensor]:
+    for rows, inputs, outputs in (*SIZES, (6000, 64, 64), (640, 64, 1), (1, 64, 64)):
+        x, w, b = (_uniform(rng, *size) for size in ((rows, inputs), (outputs, inputs), (outputs,)))
+        parts = [part.requires_grad_() for part in (x, w, b)]
+        y = linear(*parts)
+        yield from (y, *torch.autograd.grad(y, parts, _uniform(rng, rows, outputs)))
+
+
 def _products(rng: Generator) -> Iterator[Tensor]:
     for rows, inputs, outputs in SIZES:
-        x, w, b = (_uniform(rng, *size) for size in ((rows, inputs), (outputs, inputs), (outputs,)))
-        y = linear(x, w, b)
-        yield from (y, y.T @ x, x.T @ y, y @ w)
+        x, w = _uniform(rng, rows, inputs), _uniform(rng, outputs, inputs)
+        y = x @ w.T
+        yield from (y, y.T @ x, y @ w)
     yield torch.bmm(_uniform(rng, 128, 13, 5), _uniform(rng, 128, 5, 13))
     yield torch.einsum("bij,bjk->bik", _uniform(rng, 32, 20, 64), _uniform(rng, 32, 64, 20))
 
@@ -82,7 +93,7 @@ def _products(rng: Generator) -> Iterator[Tensor]:
 def _training(rng: Generator) -> Iterator[Tensor]:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(1)
-        net = nn.Sequential(nn.Linear(11, 64), nn.ReLU(), nn.Linear(64, 64), nn.Tanh(), nn.Linear(64, 3))
+        net = nn.Sequential(Linear(11, 64), nn.ReLU(), Linear(64, 64), nn.Tanh(), Linear(64, 3))
     params: list[Tensor] = list(net.parameters())
     slow = [param.detach().clone() for param in params]
     optimiser = torch.optim.Adam(params, lr=1e-3, fused=True)
@@ -107,6 +118,7 @@ GROUPS: dict[str, Callable[[Generator], Iterator[Tensor]]] = {
     "elementwise": _elementwise,
     "transcendental": _transcendental,
     "reductions": _reductions,
+    "layers": _layers,
     "products of matrices": _products,
     "training": _training,
 }

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from reports.data.frame import FINAL, Results
 from reports.data.stats import Interval, area, difference, first_at, holm, improvement, interval, welch
 from reports.render.canvas import Drawing, blank, foot, head, look, styled
-from reports.render.tables import NONE, Table, estimate, number, steps
+from reports.render.tables import MEASURED, NONE, Table, estimate, number, steps
 
 LETTERS, LONGEST = 44, 60  # of a name on a line of a legend, and beside a matrix
 MOST = 12  # arms of a matrix that can still be read
@@ -89,7 +89,7 @@ def pairs_table(results: Results, study: str) -> Table | None:
 
 
 def efficiency(results: Results, study: str) -> Table | None:
-    """Mean height of the learning curve, and steps and processor time to a level; None without finished runs."""
+    """Mean height of the learning curve, and steps to a level; None without finished runs."""
     level = reference(results, study)
     rows = [(arm, runs) for arm in results.arms(study) if len(runs := _learned(results, study, arm, level))]
     if level is None or not rows:
@@ -97,13 +97,11 @@ def efficiency(results: Results, study: str) -> Table | None:
     numbers, shown = [], []
     for arm, runs in rows:
         height, reached = interval(runs["area"].to_numpy()), runs["steps"].notna()
-        steps_to, seconds_to = runs["steps"].median(), runs["seconds"].median()
-        all_reached = bool(reached.all())
+        steps_to, all_reached = runs["steps"].median(), bool(reached.all())
         numbers.append(
             {"study": study, "arm": arm, "area": height.value, "area_low": height.low, "area_high": height.high}
             | {"level": level.value, "reached": int(reached.sum()), "seeds": len(runs)}
             | {"median_steps": steps_to if all_reached else np.nan}
-            | {"median_seconds": seconds_to if all_reached else np.nan}
         )
         shown.append(
             {
@@ -111,14 +109,30 @@ def efficiency(results: Results, study: str) -> Table | None:
                 "Mean height of the curve [95 %]": estimate(height),
                 "Seeds that reach the level": f"{int(reached.sum())} of {len(runs)}",
                 "Steps to it, median": steps(steps_to) if all_reached else NONE,
-                "Processor time to it, median": f"{seconds_to:.0f} s" if all_reached else NONE,
             }
         )
     note = (
         f"Level: {number(level.value)}, {level.words}. Steps: to each finished seed's first evaluation at or above it, "
-        "given where every seed reaches it. Processor time: that share of the run's seconds."
+        "given where every seed reaches it."
     )
     return Table(f"Sample efficiency, study {study}", pd.DataFrame(numbers), pd.DataFrame(shown), note)
+
+
+def time_to_level(results: Results, study: str) -> Table | None:
+    """Processor time to the level of `efficiency`; None where there is no level, or of no arm a time."""
+    level = reference(results, study)
+    found = {arm: _learned(results, study, arm, level) for arm in results.arms(study)}
+    medians = {arm: float(runs["seconds"].median(skipna=False)) for arm, runs in found.items() if len(runs)}
+    if level is None or np.isnan(list(medians.values())).all():
+        return None
+    numbers = pd.DataFrame({"study": study, "arm": list(medians), "median_seconds": list(medians.values())})
+    words = [NONE if np.isnan(x) else f"{x:.0f} s" for x in medians.values()]
+    shown = pd.DataFrame({"Arm": list(medians), "Processor time to it, median": words})
+    note = (
+        f"Level: {number(level.value)}, {level.words}. The share of a run's seconds that its steps to the level are, "
+        "given where every seed reaches it."
+    )
+    return Table(f"Processor time to the level, study {study}", numbers, shown, note, folder=MEASURED)
 
 
 def reference(results: Results, study: str) -> Level | None:

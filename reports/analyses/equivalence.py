@@ -135,7 +135,7 @@ class Difference(NamedTuple):
 
 def differing(here: pd.DataFrame, published: pd.DataFrame) -> Iterator[Difference]:
     """Published values of an arm that are not here with the same bits, by step."""
-    place = ["step", "seed", "metric"]
+    place = ["step", "seed", "run", "metric"]  # a yardstick has a run for each task
     both = published[[*place, "value"]].merge(here[[*place, "value"]], on=place, how="left", suffixes=("", "_here"))
     both = both.sort_values(place)
     bits = [both[name].to_numpy(np.float64).view(np.int64) for name in ("value_here", "value")]
@@ -145,7 +145,7 @@ def differing(here: pd.DataFrame, published: pd.DataFrame) -> Iterator[Differenc
 
 def finals(rows: pd.DataFrame) -> Values:
     """Final returns by seed."""
-    return rows[rows["metric"] == FINAL].sort_values("seed")["value"].to_numpy(np.float64)
+    return rows[rows["metric"] == FINAL].sort_values(["seed", "run"])["value"].to_numpy(np.float64)
 
 
 def table(compared: Sequence[Compared]) -> list[list[str]]:

@@ -17,20 +17,26 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from reports.data.drawn import content, told
 
-POINTS = ("study", "arm", "seed", "run", "step", "metric", "value")
-RUNS = (
-    *("study", "arm", "seed", "run", "status", "algorithm", "task", "profile"),
-    *("config", "fingerprint", "commit", "question", "seconds"),
-)
-TOLD = ("machine", "versions", "adopted")  # of a run, where they are exported
+PLACE = ("study", "arm", "seed", "run")
+POINTS = (*PLACE, "step", "metric", "value")
+RUNS = (*PLACE, "status", "algorithm", "task", "profile", "config", "fingerprint", "question")
+TOLD = ("machine", "versions", "adopted")
+OWN = ("commit", "seconds", *TOLD)  # how and where a run was made
+MADE = "made"  # `<study>.made.parquet`, which may be missing
 MOVED = "transfer"  # the table of trained policies with other numbers of agents and targets
 PLAYED = ("study", "arm", "seed", "run", "task", "agents", "targets", "trained_agents", "trained_targets", "value")
 ASSIGNED = "assignments"  # `<study>.assignments.parquet`: what the runs of a study assigned while they trained
-FORMS: Mapping[str, tuple[str, ...]] = {"points": POINTS, "runs": RUNS, ASSIGNED: POINTS, MOVED: PLAYED}
+FORMS: Mapping[str, tuple[str, ...]] = {
+    "points": POINTS,
+    "runs": RUNS,
+    MADE: (*PLACE, *OWN),
+    ASSIGNED: POINTS,
+    MOVED: PLAYED,
+}
 
 WHOLE = ("seed", "step", "agents", "targets", "trained_agents", "trained_targets")  # columns of integers from 0
 NUMBERS = ("value", "seconds")  # columns of numbers; an empty cell is NaN. All others hold words
-UNKNOWN = ("fingerprint", "commit", "question", *TOLD)  # words that may not be known
+UNKNOWN = ("fingerprint", "question", "commit", *TOLD)  # words that may not be known
 STUDY = re.compile(r"[\w-]+(@[\w-]+)?")  # a study's name, and of a variant
 
 
@@ -39,11 +45,20 @@ def part(path: Path) -> str:
     if path.name == f"{MOVED}.parquet":
         return MOVED
     second = path.name.removesuffix(".parquet").partition(".")[2]
-    return second if second in ("runs", ASSIGNED) else "points"
+    return second if second in ("runs", MADE, ASSIGNED) else "points"
+
+
+def earlier(path: Path) -> bool:
+    """Whether a table of runs has the form in which they still told how and where they were made."""
+    try:
+        names = pq.read_schema(pa.BufferReader(content(path))).names if part(path) == "runs" else []
+    except (OSError, ValueError, pa.ArrowException):
+        return False  # `read` says what is wrong with it
+    return not set(OWN).isdisjoint(names)
 
 
 def read(path: Path, faults: list[str]) -> pd.DataFrame:
-    """The columns of a file's form, and of `TOLD` those that are there; what is wrong goes to `faults`, a line each."""
+    """The columns of a file's form; what is wrong goes to `faults`, a line each."""
     form = FORMS[part(path)]
     try:
         table = pq.ParquetFile(pa.BufferReader(content(path))).read()
@@ -52,13 +67,12 @@ def read(path: Path, faults: list[str]) -> pd.DataFrame:
     except (OSError, ValueError, pa.ArrowException) as error:
         faults.append(f"{path.name}: not a readable Parquet table ({_why(path, error)})")
         return pd.DataFrame(columns=list(form))
-    wanted = [*form, *(name for name in TOLD if form == RUNS and name in table.column_names)]
-    found = list(_columns(table, wanted))
+    found = list(_columns(table, form))
     if not found:
-        kept = pa.table({name: _taken(table[name], name) for name in wanted})
+        kept = pa.table({name: _taken(table[name], name) for name in form})
         found = list(_study_faults(kept, path))
     faults += [f"{path.name}: {fault}" for fault in found]
-    return pd.DataFrame(columns=wanted) if found else kept.to_pandas()
+    return pd.DataFrame(columns=list(form)) if found else kept.to_pandas()
 
 
 def _why(path: Path, error: Exception) -> str:

@@ -1,8 +1,8 @@
 """The exported tables, checked: everything a report shows comes from here.
 
-A folder holds, per study, `<study>.parquet` (one row per run, step and metric) and `<study>.runs.parquet` (one row per
-planned run); `sheets` reads them. What is wrong in them is an error of one line per fault; what is not there yet is
-listed as missing.
+A folder holds, per study, `<study>.parquet` (one row per run, step and metric), `<study>.runs.parquet` (one row per
+planned run) and, if it came along, `<study>.made.parquet` (how and where runs were made); `sheets` reads them. What is
+wrong in them is an error of one line per fault; what is not there yet is listed as missing.
 """
 
 import json
@@ -19,10 +19,25 @@ from numpy.typing import NDArray
 
 from reports.data.drawn import METHOD, METHODS, Build, Scenes, content, read_methods, read_modules, read_scenes
 from reports.data.escaping import markdown
-from reports.data.exported import ASSIGNED, FORMS, MOVED, PLAYED, POINTS, RUNS, TOLD, config_fault, part, read
+from reports.data.exported import (
+    ASSIGNED,
+    FORMS,
+    MADE,
+    MOVED,
+    OWN,
+    PLACE,
+    PLAYED,
+    POINTS,
+    RUNS,
+    TOLD,
+    config_fault,
+    earlier,
+    part,
+    read,
+)
 from reports.data.stats import curve
 
-__all__ = ["ASSIGNED", "METHOD", "METHODS", "MOVED", "PLAYED", "POINTS", "RUNS", "TOLD"]
+__all__ = ["ASSIGNED", "MADE", "METHOD", "METHODS", "MOVED", "OWN", "PLACE", "PLAYED", "POINTS", "RUNS", "TOLD"]
 
 STATUSES = ("finished", "failed", "partial", "missing")
 EPISODES = "episode_*.gif"  # animations, one a task
@@ -31,6 +46,7 @@ ASSIGN = "assign/"  # prefix of its metrics
 FINAL, CURVE = "final/return", "eval/return"
 ERRORS = ("final/return_sem", "final/coverage_sem")  # of a scripted policy; one of both is there
 CHECKED = ("final/", "eval/", "theorem/", ASSIGN)  # metrics that are shown: they must be finite
+REMEDY = "`rhmc export` and `rhmc yardsticks all` write them anew, and how runs were made to *.made.parquet"
 SHOWN = 5  # faults of one kind that are spelled out
 
 # The order of arms everywhere; others follow by name.
@@ -60,7 +76,7 @@ class Results:
 
     Attributes:
         points: columns `POINTS`.
-        runs: columns `RUNS`; one row per planned run.
+        runs: columns `RUNS` and `OWN`; one row per planned run. What is not known of `OWN` is no word, or NaN.
         profile: the profile that made them.
         methods: one record per method: `METHOD` as texts, `actions`, and `parameters` per task and encoder.
         modules: the networks of Figures 1 to 3, one build per encoder.
@@ -263,6 +279,8 @@ def load(folder: Path, profile: str, only: str | None = None) -> Results:
         raise TableError(f"{folder}: no tables here; `rhmc export` writes them")
     if only is not None:
         files = _only(files, only, folder)
+    if old := [path.name for path in files if earlier(path)]:
+        raise TableError(f"{folder}: of an earlier form: {', '.join(old)}; {REMEDY}")
     faults: list[str] = []
     tables: dict[str, list[pd.DataFrame]] = {name: [] for name in FORMS}
     for path in files:
@@ -279,11 +297,12 @@ def load(folder: Path, profile: str, only: str | None = None) -> Results:
         watched, moved, notes = _of_plan(joined)
         points = _join([joined["points"], watched], POINTS)
         gifs = {path.stem.partition("_")[2]: _animation(path) for path in sorted(folder.glob(EPISODES))}
-        results = Results(points, joined["runs"], profile, moved=moved, notes=notes)
+        runs = _with_made(joined["runs"], joined[MADE])
+        results = Results(points, runs, profile, moved=moved, notes=notes)
         if only is None:
             methods, modules, scenes = drawn
             results = replace(results, methods=methods, modules=modules, scenes=scenes, episodes=gifs)
-        faults = [*_plan_faults(results), *_point_faults(results)]
+        faults = [*_made_faults(joined[MADE]), *_plan_faults(results), *_point_faults(results)]
         if not faults:
             return results
     raise TableError("\n".join(faults))
@@ -339,6 +358,18 @@ def _only(files: Sequence[Path], study: str, folder: Path) -> list[Path]:
 def _join(tables: list[pd.DataFrame], columns: Sequence[str]) -> pd.DataFrame:
     kept = [table for table in tables if len(table)]
     return pd.concat(kept, ignore_index=True) if kept else pd.DataFrame(columns=list(columns))
+
+
+def _with_made(runs: pd.DataFrame, made: pd.DataFrame) -> pd.DataFrame:
+    """The planned runs, and of each how it was made, as far as that is known."""
+    once = made.drop_duplicates(list(PLACE)).astype({"seed": "int64", "seconds": "float64"})
+    both = runs.astype({"seed": "int64"}).merge(once, how="left", on=list(PLACE))
+    return both.fillna(dict.fromkeys([name for name in OWN if name != "seconds"], ""))
+
+
+def _made_faults(made: pd.DataFrame) -> Iterator[str]:
+    for row in made[made.duplicated(list(PLACE))].itertuples():
+        yield f"{_name(row)}, run {row.run}: how it was made stands there twice"
 
 
 def _plan_faults(results: Results) -> Iterator[str]:
@@ -422,7 +453,7 @@ def _config(text: str) -> dict[str, Any]:
 
 def adopted(runs: pd.DataFrame) -> bool:
     """Whether older code made some of the runs, and trainings of the present code repeated it."""
-    return "adopted" in runs and bool(runs["adopted"].fillna("").astype(bool).any())
+    return bool(runs["adopted"].astype(bool).any())
 
 
 def mixed(runs: pd.DataFrame) -> bool:

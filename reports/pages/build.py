@@ -25,11 +25,11 @@ from reports.pages.gallery import Picture, gallery, in_short, reason, study_gall
 from reports.render import tables
 from reports.render.canvas import save, write_csv
 from reports.render.glyphs import LOST
-from reports.render.tables import Table, joined, steps
+from reports.render.tables import MEASURED, TABLES, Table, joined, steps
 
 PART = ".report-"  # begins the name of the folder in which a report is made
 DONE, UNDRAWN, BAD = 0, 1, 2  # exit codes
-MADE = ("figures", "tables", "claims.md", "claims.csv", "claims.json", "index.md", "index.html")
+MADE = ("figures", TABLES, MEASURED, "claims.md", "claims.csv", "claims.json", "index.md", "index.html")
 
 DEFINITIONS = (
     (
@@ -62,9 +62,9 @@ DEFINITIONS = (
 
 Part = TypeVar("Part")
 FIRST = ("navigation", "coverage", "scaling", "ablation")  # studies of the paper, in its order
-MORE = ("profile_", "better_", "pairs_", "steadiness_", "yardsticks")
-KINDS = ("final", "pairs", "efficiency", "assignments", "steadiness", "agents")  # of tables that every study has
-LAST = ("provenance", "runs")  # tables with a part of their own at the end
+MORE = ("profile_", "better_", "pairs_", "steadiness_", "time_", "yardsticks")
+KINDS = ("final", "pairs", "efficiency", "time", "assignments", "steadiness", "agents")  # of tables of every study
+LAST = ("provenance", "runs", "made")  # tables with a part of their own at the end
 COMPLETE = "Nothing: every planned run is finished."
 DRAWN = "rhmc drawings"
 
@@ -185,7 +185,7 @@ def _whole(results: Results, paper: Paper) -> Report:
 
 def _single(results: Results, paper: Paper, study: str) -> Report:
     own = _alone(results)
-    made = _study_tables(results, study) | {"provenance": tables.provenance(own), "runs": tables.runs(own)}
+    made = _study_tables(results, study) | _last(own)
     title = f"Study {study}, profile {results.profile}"
     lead = f"{_question(results, study)} {_lead(results)}"
     return Report(results, title, lead, study_gallery(results, paper, study), made, [], results.gaps({}), [])
@@ -200,11 +200,11 @@ def definitions(results: Results) -> list[tuple[str, str]]:
 
 def _write(report: Report, folder: Path) -> Report:
     """Write a report to an empty folder, and return it as it came out."""
-    pictures, sheets = folder / "figures", folder / "tables"
-    pictures.mkdir()
-    sheets.mkdir()
+    pictures = folder / "figures"
+    for name in ("figures", TABLES, MEASURED):
+        (folder / name).mkdir()
     for name, table in report.tables.items():
-        _save(table, sheets, name)
+        _save(table, folder / table.folder, name)
     if report.claims:
         _write_claims(report.claims, folder)
     report = report._replace(pictures=[_saved(picture, pictures) for picture in report.pictures])
@@ -261,7 +261,11 @@ def _tables(results: Results, paper: Paper) -> dict[str, Table]:
         "theorem": tables.theorem(results),
     }
     made |= {name: table for name, table in every.items() if table}
-    return made | {"provenance": tables.provenance(results), "runs": tables.runs(results)}
+    return made | _last(results)
+
+
+def _last(results: Results) -> dict[str, Table]:
+    return {"provenance": tables.provenance(results), "runs": tables.runs(results), "made": tables.made(results)}
 
 
 def _study_tables(results: Results, study: str) -> dict[str, Table]:
@@ -272,6 +276,7 @@ def _study_tables(results: Results, study: str) -> dict[str, Table]:
         "final": tables.finals(results, study),
         "pairs": comparison.pairs_table(results, study),
         "efficiency": comparison.efficiency(results, study),
+        "time": comparison.time_to_level(results, study),
         "assignments": beyond.table_assignments(results, study),
         "steadiness": steadiness if len(steadiness.shown) else None,
         "agents": scaling.table(results, found) if found else None,
@@ -310,7 +315,7 @@ def _index(report: Report) -> Iterator[str]:
             if table.note:
                 yield f"{table.note}\n"
             yield f"{table.markdown()}\n"
-            yield f"{_links('tables', name, 'CSV', 'LaTeX')}\n"
+            yield f"{_links(table.folder, name, 'CSV', 'LaTeX')}\n"
     yield "## Definitions\n"
     yield "\n".join(f"- **{name}**: {words}" for name, words in definitions(results)) + "\n"
     yield "## What is missing\n"
@@ -318,6 +323,7 @@ def _index(report: Report) -> Iterator[str]:
     yield "## Runs behind the numbers\n"
     yield f"{_origin(results)}\n"
     yield f"{report.tables['provenance'].markdown()}\n"
+    yield f"Run by run: {_links(MEASURED, 'made', 'CSV', 'LaTeX')}\n"
     yield report.tables["runs"].markdown()
 
 

@@ -129,7 +129,7 @@ def grid(name: str, table: Table, *, files: bool = True) -> Grid:
     """A table, every cell with what it is sorted by."""
     columns = [str(column) for column in table.shown.columns]
     rows = [[cell(str(text)) for text in row] for row in table.shown.to_numpy(str)]
-    return Grid(f"table-{name}", table.title, table.note, columns, rows, f"tables/{name}" if files else "")
+    return Grid(f"table-{name}", table.title, table.note, columns, rows, f"{table.folder}/{name}" if files else "")
 
 
 def cell(text: str) -> Cell:
@@ -170,14 +170,14 @@ def provenance(results: Results) -> list[tuple[str, str]]:
     """What made the runs: names and values."""
     runs = results.runs
     known = sorted(set(runs["fingerprint"].dropna().astype(str)) - {""})
-    seconds = float(runs["seconds"].fillna(0).sum())
+    spent = duration(float(runs["seconds"].sum())) if runs["seconds"].notna().any() else "not exported"
     found = [("Profile", results.profile), ("Code", ", ".join(known) or "unknown")]
     for name in TOLD:
         if name == "adopted" and not adopted(runs):
             continue
-        values = sorted(set(runs[name].dropna().astype(str)) - {""}) if name in runs else []
+        values = sorted(set(runs[name].astype(str)) - {""})
         found.append((name.capitalize(), "; ".join(values) or "not exported"))
-    return [*found, ("Processor time of all runs", duration(seconds))]
+    return [*found, ("Processor time of all runs", spent)]
 
 
 def duration(seconds: float) -> str:

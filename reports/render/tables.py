@@ -8,11 +8,12 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from reports.data.escaping import latex, line, markdown
-from reports.data.frame import FINAL, METHOD, TOLD, Results, adopted
+from reports.data.frame import FINAL, METHOD, OWN, PLACE, TOLD, Results, adopted
 from reports.data.paper import Paper
 from reports.data.stats import LEVEL, Interval, change, improvement, interval, iqm
 
 NONE = "–"  # where there is nothing to show
+TABLES, MEASURED = "tables", "measured"  # folders; in the second is what depends on machine, commit or time
 
 
 class Table(NamedTuple):
@@ -26,6 +27,7 @@ class Table(NamedTuple):
     shown: pd.DataFrame
     note: str = ""  # what a reader has to know
     marked: bool = False  # whether the cells are Markdown already
+    folder: str = TABLES
 
     def markdown(self) -> str:
         """As a Markdown table."""
@@ -202,10 +204,7 @@ def provenance(results: Results) -> Table:
     """What made the runs of every study: code, commit, machine, libraries, time."""
     numbers, shown = [], []
     for study, rows in results.runs.groupby("study"):
-        known = {
-            name: sorted(set(rows[name].dropna().astype(str)) - {""}) if name in rows else []
-            for name in ("fingerprint", "commit", *TOLD)
-        }
+        known = {name: sorted(set(rows[name].dropna().astype(str)) - {""}) for name in ("fingerprint", "commit", *TOLD)}
         done, seconds = int((rows["status"] == "finished").sum()), float(rows["seconds"].fillna(0).sum())
         numbers.append(
             {"study": study, "finished": done, "planned": len(rows), "seconds": seconds}
@@ -224,9 +223,22 @@ def provenance(results: Results) -> Table:
             }
         )
     note = "Code: one name for each method in each task. A commit with + had changes that were not committed."
+    note += f" Run by run: {MEASURED}/made.csv."
     if adopted(results.runs):
         note += " Adopted: made by older code, and repeated bit for bit by what is named there."
-    return Table("What made the runs", pd.DataFrame(numbers), pd.DataFrame(shown), note)
+    return Table("What made the runs", pd.DataFrame(numbers), pd.DataFrame(shown), note, folder=MEASURED)
+
+
+def made(results: Results) -> Table:
+    """How and where every planned run was made."""
+    rows = results.runs.sort_values(list(PLACE), kind="stable")
+    numbers = rows[[*PLACE, *OWN]].reset_index(drop=True)
+    shown = numbers[list(PLACE)].assign(
+        commit=[_short(commit) or NONE for commit in numbers["commit"]],
+        processor_time=[NONE if np.isnan(x) else f"{number(x / 60)} min" for x in numbers["seconds"]],
+    )
+    shown.columns = pd.Index([_title(name) for name in shown.columns])
+    return Table("How each run was made", numbers, shown.astype(str), folder=MEASURED)
 
 
 def _short(commit: str) -> str:
@@ -237,13 +249,13 @@ def _short(commit: str) -> str:
 
 def runs(results: Results) -> Table:
     """Every planned run, with its status and its final return."""
-    numbers = results.runs.sort_values(["study", "arm", "seed", "run"], kind="stable")
-    finals = results.points[results.points["metric"] == FINAL][["study", "arm", "seed", "run", "value"]]
-    numbers = numbers.merge(finals, how="left", on=["study", "arm", "seed", "run"])
-    numbers = numbers[["study", "arm", "seed", "run", "status", "value", "fingerprint", "commit"]]
+    numbers = results.runs.sort_values(list(PLACE), kind="stable")
+    finals = results.points[results.points["metric"] == FINAL][[*PLACE, "value"]]
+    numbers = numbers.merge(finals, how="left", on=list(PLACE))
+    numbers = numbers[[*PLACE, "status", "value", "fingerprint"]]
     numbers = numbers.rename(columns={"value": "final_return"}).reset_index(drop=True)
     shown = numbers.assign(final_return=[number(x) for x in numbers["final_return"]])
-    shown = shown.drop(columns=["fingerprint", "commit"]).astype(str)
+    shown = shown.drop(columns="fingerprint").astype(str)
     shown.columns = pd.Index([_title(name) for name in shown.columns])
     return Table("Runs behind the numbers", numbers, shown)
 

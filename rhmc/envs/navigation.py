@@ -197,7 +197,7 @@ def _relative(origin: Tensor, points: Tensor) -> Tensor:
 def _length(v: Tensor) -> Tensor:
     """Norm over the last dimension, of size 2 (several times faster than a reduction over two numbers)."""
     x, y = v.unbind(-1)
-    return torch.addcmul(x * x, y, y).sqrt()
+    return torch.hypot(x, y)  # MKL's `sqrt` differs between processors
 
 
 def _nearest_other(distance: Tensor) -> Tensor:

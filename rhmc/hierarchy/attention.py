@@ -18,6 +18,7 @@ from rhmc.learning.learner import Learner, Learners, unpack
 from rhmc.learning.normalisation import Standard
 from rhmc.learning.returns import gae, normalised
 from rhmc.learning.settings import Networks, OnPolicy, Standardised
+from rhmc.networks.linear import Linear
 from rhmc.networks.nets import ENCODERS, EncoderName, Sizes, mlp
 from rhmc.networks.sampling import bernoulli
 from rhmc.types import Batch, Obs, Spec, State
@@ -42,7 +43,7 @@ class Attended(nn.Module):
     def __init__(self, encoder: EncoderName, sizes: Sizes, hidden: int) -> None:
         super().__init__()
         self.embed = ENCODERS[encoder].pairs(sizes, hidden, hidden)
-        self.project = nn.Linear(hidden, 3 * hidden)
+        self.project = Linear(hidden, 3 * hidden)
 
     def forward(self, obs: Obs) -> Tensor:
         own = self.embed(obs).flatten(1, 2).relu()
@@ -55,7 +56,7 @@ class Assigner(nn.Module):
 
     def __init__(self, encoder: EncoderName, sizes: Sizes, hidden: int) -> None:
         super().__init__()
-        self.body, self.head = Attended(encoder, sizes, hidden), nn.Linear(hidden, 1)
+        self.body, self.head = Attended(encoder, sizes, hidden), Linear(hidden, 1)
 
     def forward(self, obs: Obs) -> Tensor:
         return self.head(self.body(obs)).view(obs.pairs.shape[:3])

@@ -31,7 +31,7 @@ class Config(Slow):
     executor: Literal["gumbel", "expected", "mixed"] = Field(
         "gumbel",
         description="an actor with a straight-through Gumbel-softmax, or with the expectation over own actions; or no "
-        "actor: the best of own values, learned through a mixture (`rhmc.mixed`)",
+        "actor: the best of own values, learned through a mixture (`rhmc.hierarchy.mixing_executor`)",
     )
     low_reward: Literal["local", "team"] = Field(
         "local", description="what the executors are paid: their scores on assigned targets, or the team's reward"

@@ -69,7 +69,7 @@ class Standard:
         seen = weight > 0
         weight = weight.clamp(min=1e-12)
         mean = mean / weight
-        deviation = (square / weight - mean.square()).clamp(min=0).sqrt().clamp(min=LEAST)
+        deviation = (square / weight - mean.square()).clamp(min=LEAST**2).rsqrt().reciprocal()  # MKL's `sqrt` differs
         return torch.where(seen, mean, 0.0), torch.where(seen, deviation, 1.0)
 
     def state_dict(self) -> State:

@@ -28,7 +28,8 @@ class Standardised(Frozen):
 
     gamma: float = Field(0.99, ge=0, le=1)
     standardise: Scale = Field(
-        "reward", description="learn from rewards, or predict returns, of mean 0 and deviation 1 (`rhmc.standardise`)"
+        "reward",
+        description="learn from rewards, or predict returns, of mean 0 and deviation 1 (`rhmc.learning.normalisation`)",
     )
 
 

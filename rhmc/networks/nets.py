@@ -8,15 +8,18 @@ over all (agent, target) pairs and pools, so that its weights act for any N and 
 
 from collections.abc import Callable
 from itertools import pairwise
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 from torch.nn.functional import elu
 
+from rhmc.networks.linear import Linear
 from rhmc.types import Obs, Spec
 
 EncoderName = Literal["mlp", "pairwise"]
+LEAST = -1e-45  # the negative number nearest to zero
 
 
 class Sizes(NamedTuple):
@@ -40,7 +43,7 @@ def mlp(*sizes: int) -> nn.Sequential:
     """Linear layers with ReLU between them; the last one is linear."""
     layers: list[nn.Module] = []
     for i, o in pairwise(sizes):
-        layers += [nn.Linear(i, o), nn.ReLU()]
+        layers += [Linear(i, o), nn.ReLU()]
     return nn.Sequential(*layers[:-1])
 
 
@@ -122,9 +125,9 @@ class _PairBody(nn.Module):
 
     def __init__(self, sizes: Sizes, hidden: int) -> None:
         super().__init__()
-        self.pair = nn.Linear(sizes.pair, hidden)
-        self.agent = nn.Linear(sizes.agent, hidden, bias=False) if sizes.agent else None
-        self.second = nn.Linear(hidden, hidden)
+        self.pair = Linear(sizes.pair, hidden)
+        self.agent = Linear(sizes.agent, hidden, bias=False) if sizes.agent else None
+        self.second = Linear(hidden, hidden)
 
     def forward(self, obs: Obs) -> Tensor:
         rows = obs.pairs.shape[:3]
@@ -168,7 +171,7 @@ class PairwiseCentral(nn.Module):
     def __init__(self, sizes: Sizes, hidden: int, out: int, *, own: int = 0, joint: int = 0) -> None:
         super().__init__()
         self.body = _AgentBody(sizes, hidden)
-        self.other = nn.Linear(self.body.width + joint, hidden)
+        self.other = Linear(self.body.width + joint, hidden)
         self.head = mlp(self.body.width + own + hidden, hidden, out)
 
     def forward(self, obs: Obs, own: Tensor | None = None, joint: Tensor | None = None) -> Tensor:
@@ -189,10 +192,10 @@ class PairwisePairs(PairNet):
     def __init__(self, sizes: Sizes, hidden: int, out: int) -> None:
         super().__init__()
         self.pairs = _PairBody(sizes, hidden)
-        self.own = nn.Linear(hidden, hidden)
-        self.row = nn.Linear(2 * hidden, hidden, bias=False)
-        self.column = nn.Linear(2 * hidden, hidden, bias=False)
-        self.head = nn.Linear(hidden, out)
+        self.own = Linear(hidden, hidden)
+        self.row = Linear(2 * hidden, hidden, bias=False)
+        self.column = Linear(2 * hidden, hidden, bias=False)
+        self.head = Linear(hidden, out)
 
     def forward(self, obs: Obs) -> Tensor:
         e = self.pairs(obs)
@@ -226,7 +229,7 @@ class FlatMixer(nn.Module):
     def __init__(self, sizes: Sizes, hidden: int, embed: int) -> None:
         super().__init__()
         state, self.embed = sizes.agents * _row(sizes), embed
-        self.first, self.bias = mlp(state, hidden, sizes.agents * embed), nn.Linear(state, embed)
+        self.first, self.bias = mlp(state, hidden, sizes.agents * embed), Linear(state, embed)
         self.second, self.value = mlp(state, hidden, embed), mlp(state, embed, 1)
 
     def forward(self, obs: Obs, values: Tensor) -> Tensor:
@@ -242,7 +245,7 @@ class PairwiseMixer(nn.Module):
         super().__init__()
         self.body = _AgentBody(sizes, hidden)
         width = self.body.width
-        self.first, self.bias = mlp(width, hidden, embed), nn.Linear(width, embed)
+        self.first, self.bias = mlp(width, hidden, embed), Linear(width, embed)
         self.second, self.value = mlp(width, hidden, embed), mlp(width, embed, 1)
 
     def forward(self, obs: Obs, values: Tensor) -> Tensor:
@@ -296,7 +299,32 @@ ENCODERS: dict[str, Encoder] = {
 
 
 def _pool(h: Tensor, dim: int) -> Tensor:
-    return torch.cat((h.mean(dim), h.amax(dim)), -1)
+    pooled: Tensor = _MeanMax.apply(h, dim)
+    return pooled
+
+
+class _MeanMax(torch.autograd.Function):
+    """Mean and maximum over one dimension side by side, with the derivatives of `mean` and `amax`, bit for bit.
+
+    That of `amax` compares numbers, which takes torch several times as long as arithmetic on them.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, h: Tensor, dim: int) -> Tensor:
+        largest = h.amax(dim)
+        ctx.save_for_backward(h, largest)
+        ctx.dim = dim
+        return torch.cat((h.mean(dim), largest), -1)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        h, largest = ctx.saved_tensors
+        by_mean, by_largest = grad.chunk(2, -1)
+        is_largest = torch.threshold_(h - largest.unsqueeze(ctx.dim), LEAST, -1.0).add_(1.0)  # 1 or 0
+        share = by_largest / is_largest.sum(ctx.dim)  # equals share
+        both = is_largest.mul_(share.unsqueeze(ctx.dim)).add_((by_mean / h.shape[ctx.dim]).unsqueeze(ctx.dim))
+        return both, None
 
 
 def _repool(h: Tensor, new: Tensor, dim: int) -> Tensor:

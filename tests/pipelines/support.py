@@ -1,7 +1,9 @@
-"""A tiny study, also as a program: `python -m tests.pipelines.support HOME POINTS` launches it."""
+"""A tiny study, also as a program: `python -m tests.pipelines.support HOME POINTS CONCURRENT` launches it."""
 
 import os
+import signal
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -35,8 +37,14 @@ def spec(seed: int = 0, **algo: Any) -> RunSpec:
     return RunSpec(**dict(setting(**algo)), seed=seed)
 
 
-def tiny(name: str = "tiny", points: int = 3, arms: dict[str, Setting] | None = None, every: int = 2) -> Study:
-    """Two arms with one seed."""
+def tiny(
+    name: str = "tiny",
+    points: int = 3,
+    arms: dict[str, Setting] | None = None,
+    every: int = 2,
+    concurrent: int = 2,
+) -> Study:
+    """Two arms with one seed. With Ray, each run at a time costs the start of a worker, some processor seconds."""
     if arms is None:
         arms = {"slow": setting(lr=1e-4), "fast": setting(lr=1e-2)}
     budget = {"evaluations": points, "steps": 200 * points}
@@ -49,7 +57,7 @@ def tiny(name: str = "tiny", points: int = 3, arms: dict[str, Setting] | None = 
         arms=arms,
         seeds=1,
         steps=200 * points,
-        resources=Resources(checkpoint_every=every),
+        resources=Resources(checkpoint_every=every, concurrent=concurrent),
     )
 
 
@@ -80,7 +88,18 @@ def started_by(driver: int, name: str = "") -> list[psutil.Process]:
     return found
 
 
+def interrupt(home: Path) -> None:
+    """Send this process Ctrl-C, once a launch of it listens and has trained on."""
+    before = set(home.glob("checkpoints/*/0*.pt"))
+    for _ in range(30_000):  # ten minutes, for a busy machine
+        listens = signal.getsignal(signal.SIGINT) is not signal.default_int_handler
+        if listens and set(home.glob("checkpoints/*/0*.pt")) - before:
+            os.kill(os.getpid(), signal.SIGINT)
+            return
+        time.sleep(0.02)
+
+
 if __name__ == "__main__":
     from pipelines.execution import run
 
-    sys.exit(run.run_studies([tiny(points=int(sys.argv[2]))], Path(sys.argv[1])))
+    sys.exit(run.run_studies([tiny(points=int(sys.argv[2]), concurrent=int(sys.argv[3]))], Path(sys.argv[1])))

@@ -2,8 +2,10 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+from matplotlib.figure import Figure
 
 from reports.data import stats
 from reports.pages.build import build
@@ -19,6 +21,16 @@ def quick_resampling(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     yield
     for kept in (stats._picks, stats._shares):
         kept.cache_clear()
+
+
+@pytest.fixture
+def unpainted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures are made and their files are empty, for tests of names and words: paint is most of a report's time."""
+
+    def empty(self: Figure, path: Path, **options: Any) -> None:
+        path.write_bytes(b"")
+
+    monkeypatch.setattr(Figure, "savefig", empty)
 
 
 @pytest.fixture(scope="session")

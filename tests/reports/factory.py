@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from reports.data.frame import METHOD, METHODS, POINTS, RUNS
+from reports.data.frame import METHOD, METHODS, OWN, PLACE, POINTS, RUNS
 
 COVERAGE = {"kind": "coverage", "preset": "flat", "agents": 4, "targets": 5, "observation": "extended"}
 NAVIGATION = {"kind": "navigation", "agents": 3, "reward": "paper"}
@@ -23,7 +23,7 @@ SCRIPTED = {
 }
 KINDS = {"full": "rhmc", "no regulation": "rhmc", "no filter": "rhmc", "RHMC": "rhmc"}
 
-Tables = tuple[pd.DataFrame, pd.DataFrame]  # points, runs
+Tables = tuple[pd.DataFrame, pd.DataFrame]  # points, and runs with how they were made
 
 
 def study(
@@ -64,7 +64,7 @@ def study(
             }
             about |= {"fingerprint": "0123456789ab", "commit": "c0ffee", "question": "Which?", "seconds": 1.5}
             plan.append(key | {"status": "finished", "profile": profile} | about)
-    return pd.DataFrame(rows, columns=list(POINTS)), pd.DataFrame(plan, columns=list(RUNS))
+    return pd.DataFrame(rows, columns=list(POINTS)), pd.DataFrame(plan, columns=[*RUNS, "commit", "seconds"])
 
 
 def yardsticks(
@@ -117,13 +117,16 @@ def half_done(points: pd.DataFrame, runs: pd.DataFrame) -> Tables:
 
 
 def write(folder: Path, *tables: Tables) -> Path:
-    """Write tables as an export does, one pair of files per study."""
+    """Write tables as an export does, three files per study."""
     folder.mkdir(parents=True, exist_ok=True)
     for points, runs in tables:
         name = [*runs["study"], *points["study"]][0]
         points.to_parquet(folder / f"{name}.parquet", index=False)
         if len(runs):
-            runs.to_parquet(folder / f"{name}.runs.parquet", index=False)
+            own = [column for column in OWN if column in runs]
+            made = runs[[*PLACE, *own]].reindex(columns=[*PLACE, *OWN], fill_value="")
+            made.to_parquet(folder / f"{name}.made.parquet", index=False)
+            runs.drop(columns=own).to_parquet(folder / f"{name}.runs.parquet", index=False)
     return folder
 
 

@@ -256,6 +256,7 @@ def test_plain_names_are_their_own_stems() -> None:
     assert escape.stem("reach_arms") != "reach_arms"  # which are the files of the study `reach`
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_studies_whose_names_are_alike_have_files_of_their_own(tmp_path: Path) -> None:
     seven = {f"arm {n}": noisy(60 + n) for n in range(7)}
     names = ("reach", "Reach", "reach_arms", "基线")

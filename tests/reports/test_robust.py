@@ -27,7 +27,7 @@ from tests.reports.factory import drawings, episode, methods, noisy, study, writ
 from tests.reports.hostile import Page
 
 pytestmark = pytest.mark.usefixtures("quick_resampling")
-POINTS, RUNS = "reach.parquet", "reach.runs.parquet"
+POINTS, RUNS, MADE = "reach.parquet", "reach.runs.parquet", "reach.made.parquet"
 Plant = Callable[[Path], Any]
 
 
@@ -102,7 +102,7 @@ REFUSED: dict[str, tuple[Plant, str]] = {
         "says '../../x'; a table of that name is of study 'reach'",
     ),
     "a numbered code": (edit(RUNS, "fingerprint", lambda _: 7), "column 'fingerprint' holds int64, not words"),
-    "worded seconds": (edit(RUNS, "seconds", lambda _: "x"), "column 'seconds' holds words, not numbers"),
+    "worded seconds": (edit(MADE, "seconds", lambda _: "x"), "column 'seconds' holds words, not numbers"),
     "no status": (edit(RUNS, "status", lambda _: None), "column 'status'"),
     "no configuration": (edit(RUNS, "config", lambda _: None), "column 'config'"),
     "a list for a task": (config('{"env": [], "trainer": "x"}'), "column 'config' holds env: Input should be"),
@@ -164,7 +164,7 @@ def test_a_table_of_another_form_is_a_line_and_the_old_report_stays(
         edit(POINTS, "value", lambda t: t["value"].astype("float32").astype(float)),
         edit(RUNS, "more", lambda t: [[1]] * len(t)),
         edit(RUNS, "question", lambda _: None),
-        edit(RUNS, "seconds", lambda _: None),
+        edit(MADE, "seconds", lambda _: None),
     ],
     ids=["a dictionary of words", "small", "whole floats", "floats", "more columns", "no question", "no seconds"],
 )
@@ -268,7 +268,7 @@ def test_figures_that_cannot_be_drawn_keep_their_places(whole: Path, monkeypatch
 
 
 def test_a_figure_that_cannot_be_saved_leaves_its_numbers(
-    whole: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     drawn = figures.learning_curves
 
@@ -278,8 +278,8 @@ def test_a_figure_that_cannot_be_saved_leaves_its_numbers(
         return drawing
 
     monkeypatch.setattr(figures, "learning_curves", broken)
-    out = whole.parent / "out"
-    assert main(["--runs", str(whole), "--out", str(out)]) == 1
+    out = tmp_path / "out"
+    assert main(["--runs", str(fresh(tmp_path / "runs")), "--out", str(out)]) == 1
     said = capsys.readouterr()
     assert said.err == "curves_reach: could not be drawn (ValueError: no ink)\n"
     assert "start with" in said.out
@@ -289,6 +289,7 @@ def test_a_figure_that_cannot_be_saved_leaves_its_numbers(
 @pytest.mark.parametrize(
     "make", [os.mkfifo, Path.mkdir, lambda p: p.write_text("no"), lambda p: p.write_bytes(b"GIF89a")]
 )
+@pytest.mark.usefixtures("unpainted")
 def test_an_animation_that_is_none_keeps_its_place(make: Plant, tmp_path: Path) -> None:
     make(fresh(tmp_path / "runs") / "episode_x.gif")
     built = build(tmp_path / "runs", tmp_path / "out", "quick")

@@ -23,6 +23,7 @@ from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import pytest
 import ray.tune.trainable.trainable
 import torch
 from mlflow.entities import ViewType
@@ -43,7 +44,16 @@ from pipelines.workspace.errors import InputError
 from pipelines.workspace.work_folder import Home
 
 ray.tune.trainable.trainable.DEFAULT_STORAGE_PATH = tempfile.gettempdir() + "/ray_results"  # not in a tester's home
-PRELOAD = ["mlflow.server", "mlflow.store.tracking.sqlalchemy_store"]
+PRELOAD = [  # whatever a launch or another verb imports: a forked process has it at once
+    *("mlflow.server", "mlflow.store.tracking.sqlalchemy_store", "torch._dynamo"),
+    *(
+        "pipelines.policies.animation",
+        "pipelines.bundles.bundle",
+        "pipelines.tracking.registry",
+        "pipelines.tuning.search_plots",
+        "reports.pages.build",
+    ),
+]
 FORKS = multiprocessing.get_context("forkserver")
 WRITES = ("INSERT", "UPDATE", "DELETE")
 KILLED = -signal.SIGKILL
@@ -262,6 +272,14 @@ def fit_here(jobs: list[dict[str, Any]], recorder: Recorders, *rest: Any) -> Non
             done = result["done"]
             recorder.result(job["key"], result)
         worker.cleanup()
+
+
+def launch_here(study: Study, home: Path) -> int:
+    """The exit code of a launch in this process, without Ray."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ray_driver, "ray_session", lambda *args: nullcontext([]))
+        patch.setattr(ray_driver, "fit", fit_here)
+        return run.run_studies([study], home)
 
 
 class Server:

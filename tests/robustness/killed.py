@@ -39,9 +39,6 @@ from tests.pipelines.support import setting, tiny
 from tests.robustness import chaos
 from tests.robustness.chaos import KILLED, Fuse, Run, faults, fit_here, logged, settle, start
 
-chaos.PRELOAD.extend(
-    ["pipelines.bundles.bundle", "pipelines.tracking.registry", "pipelines.tuning.search_plots", "reports.pages.build"]
-)
 STUDY = tiny("killed", 6, {name: setting(lr=1e-2) for name in ("fast", "twin")})  # one is trained and the other copied
 SEARCH = """\
 question: Which?
@@ -288,7 +285,7 @@ def end_of(verb: Verb, home: Path) -> End:
     files = {str(path.relative_to(home)): path for path in sorted(home.rglob("*")) if path.is_file()}
     written = {name: path.read_bytes() for name, path in files.items() if name.startswith(f"{OUT}/")}
     if verb.act is stage or verb.act is exported:
-        written = {name: content for name, content in written.items() if not name.endswith(".runs.parquet")}  # seconds
+        written = {name: content for name, content in written.items() if not name.endswith(".made.parquet")}  # seconds
     return End(runs, written, Counter(UNNAMED.sub("*", name) for name in files))
 
 

@@ -30,7 +30,7 @@ from pipelines.tuning.search_run import search_card, show_search
 from pipelines.workspace.work_folder import Home, StoreError
 from rhmc.types import Metrics
 from tests.pipelines.support import CODE, plan, setting, tiny
-from tests.robustness.chaos import everything, faults, launch
+from tests.robustness.chaos import everything, faults, launch_here
 from tests.robustness.fleet import (
     ROOT,
     Cluster,
@@ -356,7 +356,7 @@ def test_a_study_survives_the_death_of_a_node(
             return None
         return there[0] if list(home.glob(f"checkpoints/{there[0]}/0*.pt")) else None
 
-    with driver(["tests.pipelines.support", str(home), str(POINTS)], at_site, home) as launched:
+    with driver(["tests.pipelines.support", str(home), str(POINTS), "2"], at_site, home) as launched:
         victim = wait_for(on_the_other, "training on both nodes")
         other.kill()
         out = launched.end()
@@ -383,7 +383,7 @@ def assert_as_undisturbed(
         whole = folder / "whole"
         whole.mkdir()
         shutil.copy(template, whole / "mlflow.db")
-        assert launch(STUDY, whole) == 0, (whole / "driver.log").read_text()
+        assert launch_here(STUDY, whole) == 0
         assert export_study(STUDY, whole / "out", whole) == 0
         expected = everything(STUDY, whole)
     assert faults(found, expected) == dict.fromkeys(faults([], []), 0)

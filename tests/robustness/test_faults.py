@@ -1,6 +1,6 @@
 """Killed drivers, workers and servers, and damaged checkpoints: the end is that of a launch that nobody disturbed.
 
-`make soak` does the same for longer, with Ray and MLflow's own server in every launch.
+`make deep` kills more often; `make soak` does the same for longer, with Ray and MLflow's own server in every launch.
 """
 
 import random
@@ -14,11 +14,13 @@ import pytest
 from mlflow import MlflowClient
 
 from pipelines.export.tables import export_study
+from tests.depth import often
 from tests.pipelines.support import setting, tiny
 from tests.robustness.chaos import KILLED, Run, Server, damage, everything, faults, launch, start_launch
 
 RATES = {"slow": 1e-4, "fast": 1e-2, "twin": 1e-2}  # the last is copied from the one before
-STUDY = tiny(points=20, arms={arm: setting(lr=rate) for arm, rate in RATES.items()})
+STUDY = tiny(points=often(8, 20), arms={arm: setting(lr=rate) for arm, rate in RATES.items()})
+KILLS = often(5, 10)
 NOTHING_WRONG = dict.fromkeys(faults([], []), 0)
 
 
@@ -57,16 +59,14 @@ def assert_as_whole(home: Path, whole: Whole) -> None:
     assert not list(home.glob("checkpoints/*/*")), "checkpoints of finished runs"
 
 
-def test_drivers_killed_at_ten_random_writes_and_damaged_checkpoints(
-    tmp_path: Path, template: Path, whole: Whole
-) -> None:
+def test_drivers_killed_at_random_writes_and_damaged_checkpoints(tmp_path: Path, template: Path, whole: Whole) -> None:
     rng, kills, damages, campaign = random.Random(4), 0, 0, 0
-    while kills < 10:
+    while kills < KILLS:
         campaign += 1
         home = fresh(tmp_path / str(campaign), template)
         status = KILLED
         while status != 0:
-            status = launch(STUDY, home, rng.randrange(1, whole.writes // 3) if kills < 10 else 0)
+            status = launch(STUDY, home, rng.randrange(1, whole.writes // 3) if kills < KILLS else 0)
             assert status in (0, KILLED), (home / "driver.log").read_text()
             kills += status == KILLED
             damages += kills % 2 and bool(damage(home, rng))
@@ -74,11 +74,11 @@ def test_drivers_killed_at_ten_random_writes_and_damaged_checkpoints(
     assert damages >= 2
 
 
-def test_servers_killed_at_ten_random_writes(
+def test_servers_killed_at_random_writes(
     tmp_path: Path, template: Path, whole: Whole, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rng, kills, gave_up, campaign = random.Random(5), 0, 0, 0
-    while kills < 10:
+    while kills < KILLS:
         campaign += 1
         home = fresh(tmp_path / str(campaign), template)
         server = Server(home)
@@ -92,7 +92,7 @@ def test_servers_killed_at_ten_random_writes(
                 assert gave_up < 30
             if not server.alive and (kills != 3 or driver.exitcode is not None):  # once, it stays dead
                 kills += 1
-                server.start(rng.randrange(1, whole.writes // 8) if kills < 10 else 0)
+                server.start(rng.randrange(1, whole.writes // 8) if kills < KILLS else 0)
             if driver.exitcode is not None:
                 driver = start_launch(STUDY, home, uri=server.uri)
             time.sleep(0.01)
@@ -120,7 +120,7 @@ def test_a_disk_that_is_full_at_first(tmp_path: Path, template: Path, whole: Who
 
 def test_two_studies_at_once_and_a_reader(tmp_path: Path, template: Path, whole: Whole) -> None:
     home = fresh(tmp_path / "home", template)
-    other = tiny("other", points=20, arms={"slow": setting(lr=1e-4), "other": setting(lr=1e-3)})
+    other = tiny("other", points=often(8, 20), arms={"slow": setting(lr=1e-4), "other": setting(lr=1e-3)})
     drivers = [start_launch(study, home) for study in (STUDY, other)]
     client, reads = MlflowClient(f"sqlite:///{home}/mlflow.db"), 0
     while any(driver.exitcode is None for driver in drivers):

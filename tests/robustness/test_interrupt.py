@@ -1,6 +1,7 @@
-"""A driver that is killed or interrupted, as a process of its own; the next launch must end where one launch would.
+"""A driver that is killed, terminated or interrupted; the next launch must end where one launch would.
 
-The same for its workers, which are Ray's here; more kills, without Ray, are in `test_faults.py`.
+The same for its workers, which are Ray's here; more kills, without Ray, are in `test_faults.py`. What nobody disturbs
+is trained in this process: it must be equal wherever it is trained, and a worker takes seconds to start.
 """
 
 import os
@@ -8,37 +9,41 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from pipelines.execution.run import run_studies
 from pipelines.export.tables import export_study
+from pipelines.specs.study import Study
 from pipelines.tracking.mlflow_tracker import open_existing
 from pipelines.tracking.plan import study_card
 from pipelines.workspace.work_folder import Home
-from tests.pipelines.support import started_by, tiny
-from tests.robustness.chaos import WORKER
+from tests.pipelines.support import interrupt, started_by, tiny
+from tests.robustness.chaos import WORKER, launch_here
 
 pytestmark = pytest.mark.ray
-POINTS = 30
-STUDY = tiny(points=POINTS)
+POINTS = 16
+STUDY = tiny(points=POINTS, concurrent=1)
 
 
 @pytest.fixture(scope="module")
-def uninterrupted(tmp_path_factory: pytest.TempPathFactory, template: Path, cluster: None) -> bytes:
+def uninterrupted(tmp_path_factory: pytest.TempPathFactory, template: Path) -> bytes:
     """The export of a launch that nobody disturbed."""
     home = tmp_path_factory.mktemp("whole")
     shutil.copy(template, home / "mlflow.db")
-    assert run_studies([STUDY], home) == 0
+    assert launch_here(STUDY, home) == 0
     assert export_study(STUDY, home / "out", home) == 0
     return (home / "out" / "tiny.parquet").read_bytes()
 
 
-def driver(home: Path) -> subprocess.Popen[str]:
+def driver(home: Path, concurrent: int) -> subprocess.Popen[str]:
     """Launch the study in a process of its own and wait for its first checkpoint."""
-    command = [sys.executable, "-W", "ignore", "-m", "tests.pipelines.support", str(home), str(POINTS)]
+    words = [str(home), str(POINTS), str(concurrent)]
+    command = [sys.executable, "-W", "ignore", "-m", "tests.pipelines.support", *words]
     root = Path(__file__).parents[2]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
     process = subprocess.Popen(command, cwd=root, text=True, **pipes, start_new_session=True)
@@ -67,10 +72,10 @@ def statuses(home: Path) -> dict[str, str]:
     return {run.ref: run.status for run in tracker.recorded()}
 
 
-def finish(home: Path, expected: bytes) -> None:
+def finish(home: Path, expected: bytes, launch: Callable[[Study, Path], int] = launch_here) -> None:
     """Launch again: the same runs, whole, nothing doubled."""
     before = statuses(home)
-    assert run_studies([STUDY], home) == 0
+    assert launch(STUDY, home) == 0
     after = statuses(home)
     assert before.keys() <= after.keys()
     assert list(after.values()) == ["finished", "finished"]
@@ -85,7 +90,7 @@ def finish(home: Path, expected: bytes) -> None:
 
 
 def test_a_killed_driver(home: Path, uninterrupted: bytes) -> None:
-    process = driver(home)
+    process = driver(home, concurrent=1)
     process.kill()
     process.communicate()
     assert all_end(process.pid, WORKER)  # Ray's own agents take a minute more to miss their raylet
@@ -93,16 +98,24 @@ def test_a_killed_driver(home: Path, uninterrupted: bytes) -> None:
     finish(home, uninterrupted)
 
 
-def test_an_interrupted_driver(home: Path, uninterrupted: bytes) -> None:
-    process = driver(home)
-    process.send_signal(signal.SIGINT)
-    out = process.communicate(timeout=600)[0]
-    assert process.returncode == 130, out
-    assert "interrupted: each run stops at its next point" in out
-    assert "Traceback" not in out
+def test_an_interrupted_launch(
+    home: Path, uninterrupted: bytes, cluster: None, capfd: pytest.CaptureFixture[str]
+) -> None:
+    thread = threading.Thread(target=interrupt, args=(home,))
+    thread.start()
+    assert run_with_ray(STUDY, home) == 130
+    thread.join()
+    said = "".join(capfd.readouterr())
+    assert "interrupted: each run stops at its next point" in said
+    assert "Traceback" not in said
     assert set(statuses(home).values()) <= {"interrupted", "finished"}
     assert not list(home.glob("checkpoints/*/*.part"))
-    finish(home, uninterrupted)
+    finish(home, uninterrupted, run_with_ray)
+
+
+def run_with_ray(study: Study, home: Path) -> int:
+    """What `rhmc study run` does, in this process."""
+    return run_studies([study], home)
 
 
 def newest(home: Path) -> int:
@@ -111,7 +124,7 @@ def newest(home: Path) -> int:
 
 
 def test_killed_workers_and_a_terminated_driver(home: Path, uninterrupted: bytes) -> None:
-    process = driver(home)
+    process = driver(home, concurrent=2)
     workers = started_by(process.pid, WORKER)
     assert workers
     for worker in workers:

@@ -35,6 +35,7 @@ from pipelines.workspace import leftovers as litter
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.work_folder import Checkpoints, Home, StoreError, load_whole, save_atomically, without_replay
 from rhmc.training.trainer import Config, Trainer, grid_step
+from tests.depth import often
 from tests.pipelines.support import CODE, setting, tiny
 from tests.robustness.chaos import KILLED, everything, faults, import_in_a_process
 
@@ -119,6 +120,23 @@ def picture(home: Path) -> dict[str, Any]:
 
 
 # The way there
+
+
+def test_a_policy_of_a_method_that_bounds_nothing_travels(home: Path, there: Path, tmp_path: Path) -> None:
+    """RHMC without a regulator keeps half-done periods whose bound is minus infinity."""
+    settled = {"kind": "rhmc", "regulator": "none", "high_reward": "team", "filter": "off"}
+    study = tiny(arms={"free": setting(**settled)})
+    (item,) = items(study)
+    trainer = Trainer(item.spec.env, item.spec.algo, item.spec.trainer, item.spec.seed)
+    run = MlflowTracker(study_card(study), Home(home)).start(item.card)
+    run.log(list(trainer))
+    state = without_replay(trainer.state_dict())
+    assert not state["algorithm"]["pending"]["bound"].isfinite().any()
+    save_atomically(tmp_path / "policy.pt", state | {SPEC: item.spec.canonical()})
+    run.artifact(tmp_path / "policy.pt")
+    run.finish("finished")
+    pack(study, tmp_path / "b", home)
+    assert unpack(tmp_path / "b", there) == Taken(study.name, study.profile, 1, 0, 0, 0)
 
 
 @pytest.mark.parametrize("name", ["bundle", "bundle.zip"])
@@ -414,13 +432,13 @@ def bundle_seal(file: Path) -> str:
 
 
 def squeezed(folder: Path) -> None:
-    """Write a policy as an archive in which a gigabyte of zeros takes a megabyte."""
+    """Write a policy as an archive whose zeros take a thousandth of their size."""
     file = sorted(folder.glob("policies/*.pt"))[0]
     with zipfile.ZipFile(file) as archive:
         content = {info.filename: archive.read(info) for info in archive.infolist()}
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in content.items():
-            archive.writestr(name, data if name.endswith(".pkl") else bytes(2**26))
+            archive.writestr(name, data if name.endswith(".pkl") else bytes(2**22))
     seal(folder)
 
 
@@ -825,9 +843,12 @@ def test_more_files_or_bytes_than_are_taken_in(bundle: Path, there: Path, monkey
                 assert_refused(kind, there, said)
 
 
-def test_a_table_that_lies_about_its_size_finds_no_memory(bundle: Path, there: Path) -> None:
-    """The head of the table says nothing of the page of two gigabytes that follows; the system does."""
-    size = 2**31 - 2**20
+def test_a_table_that_lies_about_its_size_finds_no_memory(
+    bundle: Path, there: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The head of the table says nothing of the page of half a gigabyte that follows; the system does."""
+    size = 2**29 - 2**20
+    monkeypatch.setattr(bundle_files.limited.__wrapped__, "__defaults__", (2**30,))
     column = pa.array(["x" * size], pa.string())
     row = pq.read_table(bundle / "runs.parquet").slice(0, 1)
     at = row.column_names.index("config")
@@ -836,11 +857,11 @@ def test_a_table_that_lies_about_its_size_finds_no_memory(bundle: Path, there: P
     pq.write_table(table, sink, compression="zstd", use_dictionary=False, write_statistics=False)
     content = sink.getvalue()
     head = pq.ParquetFile(io.BytesIO(content)).metadata.row_group(0).column(at)
-    told, small = varint(2 * head.total_uncompressed_size), varint(2 * 2**28)
+    told, small = varint(2 * head.total_uncompressed_size), varint(2 * 2**27)
     assert content.count(told) == 1
     assert len(told) == len(small)
     (bundle / "runs.parquet").write_bytes(content.replace(told, small))
-    assert_refused(bundle, there, r"runs\.parquet: (not a parquet table|config: 2,146,435,072 characters)")
+    assert_refused(bundle, there, r"runs\.parquet: (not a parquet table|config: 535,822,336 characters)")
 
 
 def varint(number: int) -> bytes:
@@ -876,7 +897,8 @@ def settle(bundle: Path, home: Path) -> None:
         assert {run.status for run in log_of(home).recorded()} == {"finished"}
 
 
-NO_TIME = settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+KILLS = often(4, 12)
+NO_TIME = settings(max_examples=often(20, 60), deadline=None, suppress_health_check=list(HealthCheck))
 
 
 @NO_TIME
@@ -999,15 +1021,15 @@ def assert_no_more_than_there_is(home: Path, undisturbed: Path) -> None:
         assert {row["arm"] for row in table if row["status"] == "finished"} == done
 
 
-def test_imports_killed_at_twelve_random_writes(good: Path, tmp_path: Path, template: Path, undisturbed: Path) -> None:
+def test_imports_killed_at_random_writes(good: Path, tmp_path: Path, template: Path, undisturbed: Path) -> None:
     rng, kills, campaign = random.Random(13), 0, 0
     writes = int((undisturbed / "writes").read_text())
-    while kills < 12:
+    while kills < KILLS:
         campaign += 1
         home = made(tmp_path / str(campaign), template)
         status = KILLED
         while status != 0:
-            status = import_in_a_process(good, home, rng.randrange(1, writes) if kills < 12 else 0)
+            status = import_in_a_process(good, home, rng.randrange(1, writes) if kills < KILLS else 0)
             assert status in (0, KILLED), (home / "driver.log").read_text()
             kills += status == KILLED
             assert_no_more_than_there_is(home, undisturbed)

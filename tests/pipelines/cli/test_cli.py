@@ -26,6 +26,7 @@ from pipelines.cli.doctor import MARK
 from pipelines.export import yardsticks
 from pipelines.specs.identity import fingerprint
 from pipelines.workspace.process_pool import KILLED
+from pipelines.workspace.provenance import host
 from rhmc.scripted.yardsticks import names
 from tests.pipelines.support import jobs_of
 from tests.robustness.fleet import wait_for
@@ -403,6 +404,8 @@ def test_yardsticks_are_exported_beside_the_runs(rhmc: Rhmc, monkeypatch: pytest
     assert sorted(runs["arm"]) == ["hold", "random", "range_bound"]
     assert set(values["run"]) == set(runs["run"])
     assert set(runs["fingerprint"]) == {"0" * 12}
+    made = pd.read_parquet("o/yardsticks.made.parquet")
+    assert (sorted(made["run"]), set(made["machine"])) == (sorted(runs["run"]), {host().machine})
     assert {json.loads(config)["env"]["kind"] for config in runs["config"]} == {"coverage", "navigation"}
 
 
@@ -422,6 +425,19 @@ def test_an_export_replaces_a_policy_of_the_same_task_and_drops_other_code(
     rhmc(*words, "nearest", "--episodes", "20")
     assert list(pd.read_parquet("o/yardsticks.runs.parquet")["arm"]) == ["nearest"]
     assert set(pd.read_parquet("o/yardsticks.parquet")["arm"]) == {"nearest"}
+
+
+def test_an_export_brings_the_earlier_form_up_to_date(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipelines.export.yardsticks.fingerprint", lambda: "0" * 12)
+    words = ["yardsticks", "navigation", "--episodes", "20", "--out", "o", "--policies"]
+    rhmc(*words, "random,hold")
+    files = [Path(f"o/yardsticks.{part}.parquet") for part in ("runs", "made")]
+    new = pd.read_parquet(files[0])
+    new.assign(commit="abc", seconds=0.0).to_parquet(files[0])
+    files[1].unlink()
+    assert rhmc(*words, "random").code == 0
+    assert pd.read_parquet(files[0]).equals(new)
+    assert list(pd.read_parquet(files[1])["arm"]) == ["random"]  # of the other it is not known
 
 
 def test_an_export_leaves_a_foreign_file_alone(rhmc: Rhmc) -> None:

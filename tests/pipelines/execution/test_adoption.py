@@ -2,15 +2,24 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
+from typer.testing import CliRunner
 
+from pipelines.bundles.bundle import pack, unpack
+from pipelines.cli.main import app
 from pipelines.execution.adoption import Older, compare, older, prove
+from pipelines.export.tables import write_tables
 from pipelines.specs.study import Study
+from pipelines.tracking.mlflow_tracker import MlflowTracker, open_existing
 from pipelines.tracking.plan import Item, items, resolved_yaml, study_card
-from pipelines.tracking.tracker import MemoryTracker
+from pipelines.tracking.tracker import MemoryTracker, Recorded
 from pipelines.workspace.errors import InputError
+from pipelines.workspace.provenance import Host
+from pipelines.workspace.work_folder import Home
 from rhmc.training.trainer import Trainer
 from rhmc.types import Metrics
 from tests.pipelines.support import setting, tiny
@@ -109,3 +118,76 @@ def test_a_point_before_training_proves_nothing() -> None:
     tracker = before(STUDY)
     with pytest.raises(InputError, match=r"--until: 199 is not allowed for arm 'slow'; must be at least 200"):
         list(prove(older(items(STUDY), tracker), tracker, 1, 199, 1))
+
+
+# The command, on a log of MLflow
+
+
+@pytest.fixture
+def pair(home: Path, monkeypatch: pytest.MonkeyPatch) -> Study:
+    """Two arms with two seeds, finished under other code on another machine; one value of `fast` has been moved."""
+    study = STUDY.model_copy(update={"seeds": 2})
+    tracker = MlflowTracker(study_card(study), Home(home))
+    for item in items(study):
+        log = tracker.start(item.card._replace(fingerprint="0ldc0de00000", commit="abc", host=Host("a machine", "")))
+        points = trained(item)
+        if (item.card.arm, item.card.seed) == ("fast", 1):
+            points[1]["eval/return"] += 1.0
+        log.log(points)
+        log.finish("finished")
+    tracker.close("finished")
+    monkeypatch.setenv("RHMC_HOME", str(home))
+    monkeypatch.setattr("pipelines.cli.study.load_studies", lambda *_: [study])
+    return study
+
+
+def adopted(home: Path, study: Study) -> dict[tuple[str, str], Recorded]:
+    """The runs under their present names, by arm and key."""
+    tracker = open_existing(study_card(study), Home(home))
+    assert tracker is not None
+    keys = {item.key for item in items(study)}
+    return {(run.arm, run.key): run for run in tracker.recorded() if run.key in keys}
+
+
+def command(*words: str) -> tuple[int, list[str]]:
+    result = CliRunner().invoke(app, ["study", "adopt", "tiny.yaml", "--jobs", "1", *words])
+    return result.exit_code, result.output.splitlines()
+
+
+def test_an_arm_is_adopted_and_another_refused(pair: Study, home: Path, tmp_path: Path) -> None:
+    code, (_, first, second) = command("--verify", "2")
+    assert code == 1
+    assert first.startswith("adopted: 2 runs of arm 'slow': seeds 0, 1 trained again to step 600, ")
+    assert second.startswith("refused: arm 'fast', seed 1, step 200, eval/return: ")
+    found = adopted(home, pair)
+    assert {arm for arm, _ in found} == {"slow"}
+    said = first.removeprefix("adopted: 2 runs of arm 'slow': ")
+    for run in found.values():
+        assert (run.status, run.commit, run.host.machine) == ("finished", "abc", "a machine"), "of what computed it"
+        assert run.adopted == f"from code 0ldc0de00000: {said}"
+    tracker = open_existing(study_card(pair), Home(home))
+    assert tracker is not None
+    write_tables(pair, items(pair), tracker, tmp_path / "out")
+    rows = pq.read_table(tmp_path / "out" / "tiny.runs.parquet").to_pylist()
+    assert [(row["arm"], row["adopted"]) for row in rows if row["adopted"]] == [
+        ("slow", f"from code 0ldc0de00000: {said}")
+    ] * 2
+
+
+def test_what_lies_after_the_step_or_in_other_seeds_is_not_compared(pair: Study, home: Path) -> None:
+    code, lines = command("--verify", "1")
+    assert (code, [line[:8] for line in lines[1:]]) == (0, ["adopted:"] * 2)
+    assert len(adopted(home, pair)) == 4
+    code, lines = command()
+    assert (code, lines[1]) == (0, "no finished run of other code has the settings of a planned one that is missing")
+
+
+def test_an_adoption_travels_in_a_bundle(pair: Study, home: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    command()
+    there = tmp_path_factory.mktemp("there")
+    pack(pair, there / "bundle", home, values_only=True)
+    unpack(there / "bundle", there / "work")
+    here, moved = adopted(home, pair), adopted(there / "work", pair)
+    assert len(moved) == 4
+    assert {place: run.adopted for place, run in moved.items()} == {place: run.adopted for place, run in here.items()}
+    assert all(run.adopted.startswith("from code 0ldc0de00000: seed 0 trained again") for run in moved.values())

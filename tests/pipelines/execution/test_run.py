@@ -575,7 +575,7 @@ def test_a_run_that_another_process_trains_is_trained_when_that_lets_go(
 
 @pytest.mark.ray
 def test_run_skip_fail_and_retry(home: Path, cluster: None, capsys: pytest.CaptureFixture[str]) -> None:
-    study = tiny()
+    study = tiny(concurrent=1)
     slow, fast = study.runs()
     blocked = Home(home).checkpoints(f"{slow.spec.id}-{CODE}")
     blocked.parent.mkdir()
@@ -651,7 +651,7 @@ def test_a_log_that_fails_stops_the_study(
         raise StoreError("the disk is full")
 
     monkeypatch.setattr(Recorder, "result", full)
-    assert run_studies([tiny(points=300)], home) == 2
+    assert run_studies([tiny(points=300, concurrent=1)], home) == 2
     assert capsys.readouterr().err == "rhmc: the disk is full\n"
     tracker = open_existing(study_card(tiny()), Home(home))
     assert tracker is not None

@@ -81,6 +81,21 @@ def test_what_is_published_is_small_and_verified(exported: Path) -> None:
     assert again.read_bytes() == (publish(values, runs, "quick") / "results.parquet").read_bytes()
 
 
+def test_what_is_published_by_the_command_is_equal_to_what_it_is_of(exported: Path, tmp_path: Path) -> None:
+    for file in exported.iterdir():
+        if not file.name.endswith(".made.parquet"):
+            (tmp_path / file.name).write_bytes(file.read_bytes())
+    said = verify("--publish", "--runs", tmp_path)
+    assert said == (0, "wrote results/published/quick\n")
+    assert sorted(file.name for file in folder("quick").iterdir()) == ["results.parquet", "results.runs.parquet"]
+    assert verify("--runs", exported) == (0, "byte-equal to the published quick results: 2 arms\n")
+    moved = verify("--runs", edited(exported, tmp_path / "a", 3.0, "fast"))
+    assert (moved.code, moved.text.splitlines()[-1]) == (
+        1,
+        "against the published quick results: 1 arms not shown to be equivalent, 1 arms byte-equal",
+    )
+
+
 def test_shifted_arms(exported: Path, tmp_path: Path) -> None:
     publish(*read(exported), "quick")
     said = verify("--runs", edited(exported, tmp_path / "a", 3.0, "fast"))
@@ -106,6 +121,27 @@ def test_a_missing_seed_other_settings_and_another_profile(exported: Path, tmp_p
     said = verify("--runs", tmp_path / "paper")
     assert said == (2, f"{tmp_path / 'paper'}: results of profile paper, and --profile is quick")
     assert verify("--profile", "paper", "--runs", exported).code == 2
+
+
+def test_yardsticks_among_the_published_results_are_not_looked_for_in_a_log(
+    exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with_yardsticks = tmp_path / "all"
+    with_yardsticks.mkdir()
+    for file in exported.iterdir():
+        (with_yardsticks / file.name).write_bytes(file.read_bytes())
+        table = pd.read_parquet(file).assign(study="yardsticks")
+        if "algorithm" in table:
+            table["algorithm"] = "scripted"
+        table.to_parquet(with_yardsticks / file.name.replace("tiny", "yardsticks"))
+    said = verify("--published", with_yardsticks, "--runs", with_yardsticks)
+    assert said == (0, "byte-equal to the published quick results: 4 arms\n")
+    again = verify("--published", with_yardsticks, "--retrain", "9", "--jobs", "1")
+    assert again == (0, "byte-equal to the published quick results: 4 arms\n"), "the four trained runs"
+    asked: list[str] = []
+    monkeypatch.setattr("pipelines.export.published.export_log", lambda studies, *_: asked.extend(studies))
+    verify("--published", with_yardsticks)
+    assert asked == ["tiny"]
 
 
 def test_unfinished_results_are_not_published(tmp_path: Path) -> None:

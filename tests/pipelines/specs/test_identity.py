@@ -114,6 +114,13 @@ def test_behaviour_counts(toy: Path, old: str, new: str) -> None:
     assert name(toy) != before
 
 
+def test_the_last_digit_of_a_number_counts(toy: Path) -> None:
+    edit(toy / "inner" / "shapes.py", "SIDE = 3", "SIDE = 0.1")
+    before = name(toy)
+    edit(toy / "inner" / "shapes.py", "SIDE = 0.1", "SIDE = 0.10000000000000002")
+    assert name(toy) != before
+
+
 def test_files_and_folders_may_move(toy: Path, tmp_path: Path) -> None:
     before = name(toy)
     (toy / "deep").mkdir()
@@ -158,6 +165,12 @@ def test_relative_and_starred_imports_are_followed(toy: Path) -> None:
     edit(toy / "use.py", "from .inner.shapes import *", "import toy.other\nfrom .inner import area")
     edit(toy / "use.py", "print(", "print(toy.other.SIDE, ")
     assert {"toy.inner.shapes", "toy.other", "toy.use"} == set(digests(toy))
+
+
+def test_a_name_that_stands_in_a_quoted_annotation_alone_is_followed(toy: Path) -> None:
+    """pydantic reads annotations when a class is made."""
+    (toy / "use.py").write_text("from toy.other import area\n\n\ndef f(x: 'area') -> None: ...\n")
+    assert "toy.other" in digests(toy)
 
 
 def test_an_import_inside_a_function_is_followed(toy: Path) -> None:
@@ -265,7 +278,7 @@ EDITS = {
         set(ALGORITHMS),
         set(ENVS),
     ),
-    "arithmetic": ("portable.py", '"MKL_CBWR": "AVX2"', '"MKL_CBWR": "COMPATIBLE"', set(ALGORITHMS), set(ENVS)),
+    "arithmetic": ("portable.py", '"MKL_CBWR": "COMPATIBLE"', '"MKL_CBWR": "AVX2"', set(ALGORITHMS), set(ENVS)),
     "an init that fills a table": (
         "algorithms/__init__.py",
         "# isort: off\n",

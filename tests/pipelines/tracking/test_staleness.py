@@ -73,6 +73,10 @@ def test_runs_of_one_reason_are_one_line_and_many_settings_are_cut() -> None:
     (line,) = reasons(items(study), tracker.recorded(), tracker)
     assert line.startswith("stale: arm 'one', 3 runs: other settings: algo.batch was 31, now 32, ")
     assert line.endswith(" and 1 more")
+    tracker = MemoryTracker(study_card(study), [])
+    log(tracker, changed(items(study)[0], gamma=0.5, hidden=17, batch=31, buffer=401))
+    (line,) = reasons(items(study), tracker.recorded(), tracker)
+    assert line.endswith("algo.hidden was 17, now 64"), "all four are named"
 
 
 def test_mlflow_keeps_the_list(home: Path) -> None:

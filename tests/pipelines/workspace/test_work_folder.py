@@ -259,7 +259,7 @@ def test_a_folder_of_any_name_keeps_everything_inside(tmp_path: Path, monkeypatc
 
 def test_a_launch_in_a_folder_of_any_name(tmp_path: Path) -> None:
     home = tmp_path / HOSTILE.strip()
-    words = [sys.executable, "-W", "ignore", "-m", "tests.pipelines.support", str(home), "2"]
+    words = [sys.executable, "-W", "ignore", "-m", "tests.pipelines.support", str(home), "2", "1"]
     root = Path(__file__).parents[3]
     done = subprocess.run(words, cwd=root, capture_output=True, text=True, timeout=500, check=False)
     assert done.returncode == 0, done.stdout + done.stderr

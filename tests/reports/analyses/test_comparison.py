@@ -1,5 +1,6 @@
 """Arms against each other: corrections, profiles and areas against independent computations."""
 
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from scipy.stats import norm, t
 from reports.analyses import comparison
 from reports.data import stats
 from reports.data.frame import Results, load
+from reports.render.tables import NONE
 from tests.reports.factory import NAVIGATION, noisy, study, write, yardsticks
 
 chances = st.lists(st.floats(0, 1), min_size=1, max_size=6).map(np.array)
@@ -134,10 +136,26 @@ def test_efficiency_is_to_the_scripted_level(results: Results) -> None:
     for _, points in results.curve("coverage", "RHMC").groupby("seed"):
         steps.append(points[points["value"] >= 65.3]["step"].min())
     assert rows["median_steps"]["RHMC"] == np.median(steps)
-    assert rows["median_seconds"]["RHMC"] == pytest.approx(1.5 * np.median(steps) / 150_000)
     assert np.isnan(rows["median_steps"]["IQL"])  # a seed never reaches it: missing, not the seeds that do
+    time = comparison.time_to_level(results, "coverage")
+    assert time is not None
+    seconds = time.numbers.set_index("arm")["median_seconds"]
+    assert seconds["RHMC"] == pytest.approx(1.5 * np.median(steps) / 150_000)
+    assert np.isnan(seconds["IQL"])
+    assert time.shown.set_index("Arm").loc["IQL"].tolist() == [NONE]
     areas = [np.trapezoid(x["value"], x["step"]) / 150_000 for _, x in results.curve("coverage", "IQL").groupby("seed")]
     assert rows["area"]["IQL"] == pytest.approx(np.mean(areas))
+
+
+def test_time_is_shown_where_it_is_known_of_every_seed(results: Results) -> None:
+    some = results.runs.assign(seconds=results.runs["seconds"].mask(results.runs["seed"] == 0))
+    table = comparison.time_to_level(replace(results, runs=some), "coverage")
+    assert table is None  # of every arm one seed's is not known
+    one = results.runs["seconds"].mask((results.runs["seed"] == 0) & (results.runs["arm"] == "RHMC"))
+    table = comparison.time_to_level(replace(results, runs=results.runs.assign(seconds=one)), "coverage")
+    assert table is not None
+    known = table.numbers.set_index("arm")["median_seconds"].notna()
+    assert known.to_dict() == {"RHMC": False, "QMIX": True, "IQL": False, "VDN": False}
 
 
 def test_without_a_scripted_level_the_best_arm_gives_it(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from scipy.stats import t
 
 from reports.analyses.equivalence import compare, differing, finals, read, summary, table
 from reports.data.frame import TableError
-from reports.data.stats import equivalence
+from reports.data.stats import equivalence, equivalence_of_pairs
 from tests.reports import factory
 
 SEEDS = [60.0, 60.2, 59.9, 60.1, 60.3]
@@ -88,6 +88,16 @@ def test_missing_seeds_and_other_settings_do_not_hold() -> None:
     assert outcome(changed, published) == "other settings"
 
 
+def test_several_runs_of_an_arm_and_seed_are_told_apart() -> None:
+    """As of a yardstick, which has one for each task."""
+    published = pd.concat([tables(a=[60.0]), tables(a=[20.0]).assign(run="0ther")], ignore_index=True)
+    assert outcome(published.sample(frac=1, random_state=0), published) == "byte-equal"
+    here = published.copy()
+    here.loc[here["run"] == "0ther", "value"] += 1.0
+    assert {one.published for one in differing(here, published)} <= set(published[published["run"] == "0ther"]["value"])
+    assert finals(published).tolist() == finals(published.iloc[::-1]).tolist()
+
+
 def test_more_seeds_here_than_published_do_no_harm() -> None:
     assert outcome(tables(a=SEEDS), tables(a=SEEDS[:2])) == "byte-equal"
 
@@ -112,6 +122,16 @@ def test_equivalence_where_there_is_little_to_go_by() -> None:
     assert np.isnan(equivalence(one, two, 1.0))
     assert equivalence(two, two + 0.5, 1.0) == 0.0
     assert equivalence(two, two + 1.0, 1.0) == 1.0
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.8, -0.8, 1.2, -1.2])
+def test_equivalence_of_pairs_against_its_formula(shift: float) -> None:
+    gaps = np.array([0.1, -0.2, 0.05, 0.3]) + shift
+    mean, se = gaps.mean(), gaps.std(ddof=1) / 2
+    assert equivalence_of_pairs(gaps, 1.0) == pytest.approx(max(t.sf((mean + 1) / se, 3), t.cdf((mean - 1) / se, 3)))
+    assert np.isnan(equivalence_of_pairs(gaps[:1], 1.0))
+    assert equivalence_of_pairs(np.array([0.5, 0.5]), 1.0) == 0.0
+    assert equivalence_of_pairs(np.array([-1.0, -1.0]), 1.0) == 1.0
 
 
 def test_folders_are_read_whole_or_not_at_all(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from reports.data import frame
-from reports.data.frame import TableError, load
+from reports.data.frame import RUNS, TableError, load
 from tests.reports import factory
 from tests.reports.factory import COVERAGE, NAVIGATION, Tables, study, write, yardsticks
 
@@ -149,6 +149,46 @@ def test_files_that_are_not_there_or_not_tables(tmp_path: Path) -> None:
     (folder / "ablation.runs.parquet").write_text("text")
     with pytest.raises(TableError, match=r"ablation\.runs\.parquet: not a readable Parquet table"):
         load(folder, "quick")
+
+
+def test_how_runs_were_made_may_be_missing(tmp_path: Path) -> None:
+    folder = write(tmp_path, study("ablation", ARMS))
+    whole = load(folder, "quick")
+    assert (set(whole.runs["commit"]), whole.runs["seconds"].sum()) == ({"c0ffee"}, 9.0)
+    made = pd.read_parquet(folder / "ablation.made.parquet")
+    made[made["seed"] > 0].to_parquet(folder / "ablation.made.parquet")
+    some = load(folder, "quick").runs.groupby("seed")
+    assert some["commit"].unique().map(list).to_dict() == {0: [""], 1: ["c0ffee"], 2: ["c0ffee"]}
+    assert some["seconds"].sum(min_count=1).isna().to_dict() == {0: True, 1: False, 2: False}
+    (folder / "ablation.made.parquet").unlink()
+    none = load(folder, "quick")
+    assert none.runs[list(RUNS)].equals(whole.runs[list(RUNS)])
+    assert none.points.equals(whole.points)
+    assert set(none.runs[["commit", "machine", "versions", "adopted"]].to_numpy().ravel()) == {""}
+    assert none.runs["seconds"].isna().all()
+
+
+def test_how_a_run_was_made_stands_there_once(tmp_path: Path) -> None:
+    folder = write(tmp_path, study("ablation", ARMS))
+    made = pd.read_parquet(folder / "ablation.made.parquet")
+    pd.concat([made, made.head(1)]).to_parquet(folder / "ablation.made.parquet")
+    with pytest.raises(
+        TableError, match=r"^ablation, arm 'full', seed 0, run \w+: how it was made stands there twice$"
+    ):
+        load(folder, "quick")
+
+
+def test_tables_of_the_earlier_form_are_one_line(tmp_path: Path) -> None:
+    folder = write(tmp_path, study("ablation", ARMS), study("coverage", {"RHMC": [1.0]}), study("reach", {"x": [1.0]}))
+    for name in ("ablation", "coverage"):
+        both = [pd.read_parquet(folder / f"{name}.{part}.parquet") for part in ("runs", "made")]
+        both[0].merge(both[1]).drop(columns="machine").to_parquet(folder / f"{name}.runs.parquet")
+    with pytest.raises(TableError) as error:
+        load(folder, "quick")
+    assert str(error.value) == (
+        f"{folder}: of an earlier form: ablation.runs.parquet, coverage.runs.parquet; `rhmc export` and "
+        "`rhmc yardsticks all` write them anew, and how runs were made to *.made.parquet"
+    )
 
 
 def test_unfinished_is_missing_and_not_zero(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -47,6 +48,14 @@ def made(runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def few(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Tables that are quickly reported on."""
     return write(tmp_path_factory.mktemp("few"), study("coverage", {"RHMC": noisy(67), "IQL": noisy(63)}, points=4))
+
+
+@pytest.fixture(scope="module")
+def little(few: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Their report. Not to be changed."""
+    out = tmp_path_factory.mktemp("little")
+    build(few, out, "quick")
+    return out
 
 
 def content(folder: Path) -> dict[str, bytes]:
@@ -127,17 +136,15 @@ def test_table_1(runs: Path, made: Path) -> None:
     assert f"## Table 1: the methods\n\n{table.note}\n\n{table.markdown()}\n" in text
 
 
-def test_a_report_without_animations_says_so(few: Path, tmp_path: Path) -> None:
-    build(few, tmp_path, "quick")
-    assert "- Animations: none; `rhmc render --out` writes them." in (tmp_path / "index.md").read_text()
+def test_a_report_without_animations_says_so(little: Path) -> None:
+    assert "- Animations: none; `rhmc render --out` writes them." in (little / "index.md").read_text()
 
 
-def test_a_report_without_methods_says_so(few: Path, tmp_path: Path) -> None:
-    build(few, tmp_path, "quick")
-    text = (tmp_path / "index.md").read_text()
+def test_a_report_without_methods_says_so(little: Path) -> None:
+    text = (little / "index.md").read_text()
     assert "- Table 1: no methods; `rhmc methods --out` writes them.\n" in text
     assert "## Table 1" not in text
-    assert not (tmp_path / "tables" / "table_1.md").exists()
+    assert not (little / "tables" / "table_1.md").exists()
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1]", '{"a": 1}', '[{"kind": "x"}]'])
@@ -270,6 +277,7 @@ def test_spread_leaves_alone_what_is_apart() -> None:
     assert figures.spread([0.5, 0.5], 0.04, 0, 1) == pytest.approx([0.48, 0.52])
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_a_study_that_is_not_there(tmp_path: Path) -> None:
     out = tmp_path / "out"
     build(write(tmp_path / "runs", study("coverage", {"RHMC": noisy(67), "IQL": noisy(63)})), out, "quick")
@@ -290,23 +298,26 @@ def test_faulty_tables_leave_the_old_report(few: Path, tmp_path: Path, capsys: p
     assert content(out) == before
 
 
-def test_a_failure_half_way_leaves_the_old_report(few: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    build(few, tmp_path, "quick")
-    before = content(tmp_path)
+def test_a_failure_half_way_leaves_the_old_report(
+    few: Path, little: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = Path(shutil.copytree(little, tmp_path / "out"))
+    before = content(out)
     monkeypatch.setattr(report, "_index", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        build(few, tmp_path, "quick")
-    assert content(tmp_path) == before
+        build(few, out, "quick")
+    assert content(out) == before
 
 
-def test_a_rebuild_removes_what_is_no_more(few: Path, tmp_path: Path) -> None:
-    (tmp_path / "runs").mkdir()
-    keep = tmp_path / "runs" / "a.txt"
+@pytest.mark.usefixtures("unpainted")
+def test_a_rebuild_removes_what_is_no_more(little: Path, tmp_path: Path) -> None:
+    out = Path(shutil.copytree(little, tmp_path / "out"))
+    (out / "runs").mkdir()
+    keep = out / "runs" / "a.txt"
     keep.write_text("mine")
-    build(few, tmp_path, "quick")
-    assert (tmp_path / "figures" / "fig_7.png").exists()
-    build(write(tmp_path / "other", study("other", {"RHMC": noisy(67)})), tmp_path, "quick")
-    assert not (tmp_path / "figures" / "fig_7.png").exists()
+    assert (out / "figures" / "fig_7.png").exists()
+    build(write(tmp_path / "other", study("other", {"RHMC": noisy(67)})), out, "quick")
+    assert not (out / "figures" / "fig_7.png").exists()
     assert keep.read_text() == "mine"
 
 
@@ -317,6 +328,7 @@ def test_an_unreadable_table_is_an_error_of_its_own(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_a_study_that_the_paper_does_not_have_gets_its_curves(runs: Path, tmp_path: Path) -> None:
     for part in ("", ".runs"):
         table = pd.read_parquet(runs / f"coverage{part}.parquet").assign(study="reach")

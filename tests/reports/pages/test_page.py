@@ -131,6 +131,7 @@ def test_what_made_the_runs(read: Reader) -> None:
     assert "not all made by the same code" not in read.text
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_machine_and_versions_where_they_are_exported(tmp_path: Path) -> None:
     points, runs = study("coverage", {"RHMC": noisy(67), "IQL": noisy(63)}, points=4)
     told = runs.assign(machine="two cores", versions="torch 2.13.0", fingerprint=["a", "a", "b"] * 2, seconds=1800.0)
@@ -140,6 +141,18 @@ def test_machine_and_versions_where_they_are_exported(tmp_path: Path) -> None:
     assert "The runs were not all made by the same code." in text
 
 
+def test_a_page_without_how_the_runs_were_made(tmp_path: Path) -> None:
+    folder = write(tmp_path, study("coverage", {"RHMC": noisy(67), "IQL": noisy(63)}, points=4))
+    (folder / "coverage.made.parquet").unlink()
+    build(folder, tmp_path / "out", "quick")
+    text = Reader((tmp_path / "out" / "index.html").read_text()).text
+    assert "Machine not exported Versions not exported Processor time of all runs not exported" in text
+    assert "commit unknown." in (tmp_path / "out" / "index.md").read_text()
+    assert not (tmp_path / "out" / "measured" / "time_coverage.csv").exists()
+    assert pd.read_csv(tmp_path / "out" / "measured" / "made.csv")["commit"].isna().all()
+
+
+@pytest.mark.usefixtures("unpainted")
 def test_one_study(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arms = {"one": noisy(67), "two": noisy(63), "three": noisy(50)}
     runs = write(tmp_path / "runs", study("reach", arms, points=4), study("other", {"x": noisy(1)}), yardsticks())
@@ -157,6 +170,7 @@ def test_one_study(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "no table of study 'raech' here (there are other, reach)" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_a_fault_in_another_study_does_not_stop_it(tmp_path: Path) -> None:
     points, runs = study("other", {"x": noisy(1)}, points=4)
     write(tmp_path, study("reach", {"one": noisy(67)}, points=4), (points.assign(value=np.nan), runs))

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from rhmc.envs import coverage, make_env, navigation
+from rhmc.networks.linear import Linear
 from rhmc.networks.nets import ENCODERS, Sizes, append, mlp
 from rhmc.types import Obs
 
@@ -193,7 +194,7 @@ def test_append_puts_features_last_and_leaves_the_rest() -> None:
 
 def test_mlp_is_linear_at_its_end_and_rectified_between() -> None:
     net = mlp(2, 5, 1)
-    assert [type(layer) for layer in net] == [nn.Linear, nn.ReLU, nn.Linear]
+    assert [type(layer) for layer in net] == [Linear, nn.ReLU, Linear]
     x = torch.randn(4, 2)
     first, _, last = net
     assert torch.equal(net(x), last(first(x).clamp(min=0)))
