@@ -168,7 +168,7 @@ def test_an_arm_is_adopted_and_another_refused(pair: Study, home: Path, tmp_path
     tracker = open_existing(study_card(pair), Home(home))
     assert tracker is not None
     write_tables(pair, items(pair), tracker, tmp_path / "out")
-    rows = pq.read_table(tmp_path / "out" / "tiny.runs.parquet").to_pylist()
+    rows = pq.read_table(tmp_path / "out" / "tiny.made.parquet").to_pylist()
     assert [(row["arm"], row["adopted"]) for row in rows if row["adopted"]] == [
         ("slow", f"from code 0ldc0de00000: {said}")
     ] * 2
