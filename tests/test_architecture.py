@@ -18,6 +18,7 @@ from ruamel.yaml import YAML
 
 from pipelines.specs.study import Study
 from rhmc.algorithms import ALGORITHMS
+from tests.conftest import LONGEST
 
 ROOT = Path(__file__).parents[1]
 PAGE = 200  # lines that a method may take
@@ -363,6 +364,11 @@ def test_there_are_two_journeys_and_a_stop_that_is_gone_is_found() -> None:
 def test_the_tests_stand_in_the_rooms_that_they_test() -> None:
     found = {path.parent for package in ROOMS for path in (ROOT / "tests" / package).glob("*/test_*.py")}
     assert sorted(ROOT / folder.relative_to(ROOT / "tests") for folder in found) == HOUSE
+
+
+def test_the_longest_files_of_tests_are_there() -> None:
+    there = {f"{path.parent.name}/{path.stem}" for path in (ROOT / "tests").rglob("test_*.py")}
+    assert sorted({*LONGEST} - there) == []
 
 
 @pytest.mark.parametrize("path", files())
