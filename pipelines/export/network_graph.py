@@ -20,8 +20,8 @@ TASK = {"agents": 4, "targets": 5}  # section 5.2
 BUILDS = {"mlp": "paper", "pairwise": "extended"}  # encoder -> the observation that it is studied with
 OPERATIONS = {  # what the gradient's graph calls it -> what it does
     "MaskedFillBackward": "filter",
-    "AmaxBackward": "mean, max",
-    "MeanBackward": "mean, max",
+    "_MeanMaxBackward": "mean, max",
+    "MeanBackward": "mean",
     "SumBackward": "sum",
     "AddBackward": "sum",
     "ReluBackward": "ReLU",

@@ -29,8 +29,8 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
     """x weight^T + bias: (..., in), (out, in), (out,) -> (..., out)."""
     if _product is None or not X86 or x.device.type != "cpu":
         return functional.linear(x, weight, bias)
-    y: Tensor = _Linear.apply(x.reshape(-1, x.shape[-1]), weight, bias)
-    return y.view(*x.shape[:-1], len(weight))
+    y: Tensor = _Linear.apply(x.flatten(0, -2), weight, bias)
+    return y if x.dim() == 2 else y.unflatten(0, x.shape[:-1])  # of rows no view: what is done to it in place is cheap
 
 
 def product(a: Tensor, b: Tensor, bias: Tensor | None = None) -> Tensor:
