@@ -74,5 +74,8 @@ class _Linear(torch.autograd.Function):
 
 
 def _outer(grad: Tensor, x: Tensor) -> Tensor:
-    """grad^T x: (rows, out), (rows, in) -> (out, in). oneDNN copies its left side: the narrow one stands there."""
-    return product(grad.t(), x.t()) if grad.shape[1] <= x.shape[1] else product(x.t(), grad.t()).t()
+    """grad^T x: (rows, out), (rows, in) -> (out, in). oneDNN copies its left side: the narrow one stands there.
+
+    It lies in memory as the weights do, without which the fused optimiser takes other numbers for it.
+    """
+    return product(grad.t(), x.t()) if grad.shape[1] <= x.shape[1] else product(x.t(), grad.t()).t().contiguous()

@@ -57,6 +57,7 @@ def test_values_and_derivatives_are_those_of_a_linear_layer(size: tuple[int, int
         torch.autograd.grad(y, mine, grad), torch.autograd.grad(exact, theirs, grad.double()), strict=True
     ):
         assert found.shape == wanted.shape
+        assert found.is_contiguous(), "the fused optimiser reads gradients as they lie in memory"
         assert torch.allclose(found.double(), wanted, rtol=1e-4, atol=1e-3)
 
 
