@@ -40,14 +40,14 @@ setup: $(READY) ## The environment in .venv, exactly as in requirements.lock
 repro: $(READY) ## Train, track and report on the profile in params.yaml; an interrupted one continues
 	@rhmc profile > /dev/null
 	@dvc repro || { echo "Not finished. What is done is kept: \`make repro\` continues."; exit 1; }
-	@profile=$$(rhmc profile); out="reports/$$profile"; \
+	@profile=$$(rhmc profile); out="results/$$profile"; \
 	  [[ -e "$$out/index.html" && -z "$$(find "$$out/runs" -newer "$$out/index.html")" ]] || \
 	  rhmc report --profile "$$profile"
 	@echo
-	@echo "Report:    reports/$$(rhmc profile)/index.html"
+	@echo "Report:    results/$$(rhmc profile)/index.html"
 	@echo "MLflow UI: run \`make ui\` and open the address that it prints"
-	@profile=$$(rhmc profile); test ! -d "reports/published/$$profile" || \
-	  rhmc verify --runs "reports/$$profile/runs" --profile "$$profile" || test $$? -eq 1
+	@profile=$$(rhmc profile); test ! -d "results/published/$$profile" || \
+	  rhmc verify --runs "results/$$profile/runs" --profile "$$profile" || test $$? -eq 1
 
 test: check ## Lint, types and every test
 	@python -m pytest -n $(JOBS) $(SHARED)
@@ -65,7 +65,7 @@ bench: $(READY) ## Speed of the environments and of training, as Markdown tables
 	@python benchmarks/train_speed.py
 
 soak: $(READY) ## Kill drivers, workers and servers of studies again and again; prints what was lost (nothing)
-	@python -m tests.pipelines.soak --kills $(KILLS) --seed $(SEED)
+	@python -m tests.robustness.soak --kills $(KILLS) --seed $(SEED)
 
 report: $(READY) ## The report again, from the exported runs
 	@profile=$$(rhmc profile) && rhmc report --profile "$$profile"
@@ -81,7 +81,7 @@ lock: $(READY) ## Write requirements.lock from .venv, after a deliberate change 
 clean: ## Remove .venv and caches; results stay
 	@rm -rf .venv .mypy_cache .pytest_cache .ruff_cache .hypothesis build *.egg-info
 	@find rhmc pipelines reports benchmarks tests -name __pycache__ -prune -exec rm -rf {} +
-	@echo "Removed .venv and the caches. Kept every result: work/ (runs, checkpoints) and reports/ (remove by hand)."
+	@echo "Removed .venv and the caches. Kept every result: work/ (runs, checkpoints) and results/ (remove by hand)."
 
 # torch comes first and alone, so that a build with CUDA is seen before its packages are fetched.
 $(READY): requirements.lock pyproject.toml

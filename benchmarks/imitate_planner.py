@@ -14,9 +14,9 @@ from torch import Generator, Tensor
 from torch.nn.functional import cross_entropy
 
 from rhmc.envs import coverage, make_env
-from rhmc.learner import Learner, pack, unpack
-from rhmc.nets import ENCODERS, Sizes
-from rhmc.schedules import linear
+from rhmc.learning.learner import Learner, pack, unpack
+from rhmc.learning.schedules import linear
+from rhmc.networks.nets import ENCODERS, Sizes
 from rhmc.scripted.coverage import planner
 from rhmc.types import Batch, Obs
 

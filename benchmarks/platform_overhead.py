@@ -1,8 +1,8 @@
 """What Ray, MLflow and checkpoints cost: the same trainings in a bare loop and through `rhmc study run`.
 
-Bare: a loop over `rhmc.trainer.Trainer` in plain processes, two at a time; no Ray, no log, no checkpoint. Both sides
-train the arms `full` and `no filter` of studies/ablation.yaml with two seeds each, bare and platform in turn, and must
-end with the same returns. Prints Markdown.
+Bare: a loop over `rhmc.training.trainer.Trainer` in plain processes, two at a time; no Ray, no log, no checkpoint. Both
+sides train the arms `full` and `no filter` of studies/ablation.yaml with two seeds each, bare and platform in turn, and
+must end with the same returns. Prints Markdown.
 
 Seconds of processor time come from the processes themselves, those of Ray's own processes from looking at them once a
 second. Evaluation is part of training. The parts of a launch are timed where they happen, inside one launch: where
@@ -28,11 +28,11 @@ from typing import Any
 import env_speed
 import psutil
 
-import rhmc.evaluate
-import rhmc.trainer
-from pipelines.ray_settings import set_up_ray
-from pipelines.study import Resources, RunSpec, Study
-from pipelines.trainable import RunTrainable
+import rhmc.training.evaluation
+import rhmc.training.trainer
+from pipelines.execution.ray_settings import set_up_ray
+from pipelines.execution.trainable import RunTrainable
+from pipelines.specs.study import Resources, RunSpec, Study
 
 ROOT = Path(__file__).parents[1]
 STUDY = Path("studies") / "ablation.yaml"
@@ -96,8 +96,8 @@ class Stopwatch:
 
 def watch_evaluation(watch: Stopwatch) -> None:
     """Time evaluations apart from the training they are part of; by this stopwatch alone."""
-    rhmc.trainer.evaluate = rhmc.evaluate.evaluate
-    watch.watch(rhmc.trainer, "evaluate", "evaluation")
+    rhmc.training.trainer.evaluate = rhmc.training.evaluation.evaluate
+    watch.watch(rhmc.training.trainer, "evaluate", "evaluation")
 
 
 # Bare
@@ -108,7 +108,7 @@ def train(spec: str) -> dict[str, Any]:
     watch = Stopwatch()
     watch_evaluation(watch)
     run = RunSpec.model_validate_json(spec)
-    trainer = rhmc.trainer.Trainer(run.env, run.algo, run.trainer, run.seed)
+    trainer = rhmc.training.trainer.Trainer(run.env, run.algo, run.trainer, run.seed)
     began, last = time.time(), {}
     while not trainer.done:
         with watch.time("training"):
@@ -164,7 +164,9 @@ def platform(changes: list[str], out: Path) -> None:
     import ray
     from ray import tune
 
-    from pipelines import cli, mlflow_tracker, overview, ray_driver, recorder
+    from pipelines.cli import main as cli
+    from pipelines.execution import ray_driver, recorder
+    from pipelines.tracking import mlflow_tracker, overview
 
     watch, runs = Stopwatch(), dict[str, dict[str, Any]]()
     set_up_ray()

@@ -30,10 +30,10 @@ import env_speed
 import psutil
 from platform_overhead import ROOT, Stopwatch
 
-from pipelines.ray_settings import set_up_ray
-from pipelines.study import RunSpec, Study
-from pipelines.trainable import RunTrainable
-from rhmc.trainer import Trainer, grid_step
+from pipelines.execution.ray_settings import set_up_ray
+from pipelines.execution.trainable import RunTrainable
+from pipelines.specs.study import RunSpec, Study
+from rhmc.training.trainer import Trainer, grid_step
 from rhmc.types import Metrics, State
 
 FILE = """\
@@ -103,7 +103,9 @@ class Simulated(RunTrainable):
 
 def drive(file: Path, until: int, out: Path) -> None:
     """`rhmc study run`, interrupted after so many finished runs (0: not)."""
-    from pipelines import cli, mlflow_tracker, overview, ray_driver, recorder, run
+    from pipelines.cli import main as cli
+    from pipelines.execution import ray_driver, recorder, run
+    from pipelines.tracking import mlflow_tracker, overview
 
     set_up_ray()
     import ray
@@ -157,9 +159,9 @@ def now() -> list[float]:
 
 def fill(file: Path, home: Path, leave: int) -> int:
     """Copy a finished run to all planned ones that are not logged, but for the last few; returns how many."""
-    from pipelines.mlflow_tracker import open_existing
-    from pipelines.plan import commit, items, study_card
-    from pipelines.store import Home
+    from pipelines.tracking.mlflow_tracker import open_existing
+    from pipelines.tracking.plan import commit, items, study_card
+    from pipelines.workspace.work_folder import Home
 
     study = Study.load(file)
     tracker = open_existing(study_card(study), Home(home))
@@ -240,7 +242,7 @@ def command(words: list[str], home: Path, codes: tuple[int, ...] = (0, 1)) -> Co
 
 def rhmc(home: Path, *words: str) -> Cost:
     """A command of the program."""
-    return command(["-m", "pipelines.cli", *words], home)
+    return command(["-m", "pipelines.cli.main", *words], home)
 
 
 def launch(file: Path, home: Path, until: int) -> Cost:
@@ -262,7 +264,7 @@ def server(home: Path) -> Iterator[tuple[str, Callable[[], float]]]:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     address = f"http://127.0.0.1:{port}"
-    words = [sys.executable, "-W", "ignore", "-m", "pipelines.cli", "ui", "--port", str(port)]
+    words = [sys.executable, "-W", "ignore", "-m", "pipelines.cli.main", "ui", "--port", str(port)]
     with (home / "log").open("w", encoding="utf-8") as log:
         process = subprocess.Popen(words, cwd=ROOT, env=environment(home), stdout=log, stderr=log)
     try:

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from reports.build import build
-from reports.frame import OWN, PLACE, POINTS, RUNS
+from reports.data.frame import OWN, PLACE, POINTS, RUNS
+from reports.pages.build import build
 
 STUDIES = ("ablation", "coverage", "reach", "scaling")
 METHODS = ("RHMC", "HiT-MAC", "QMIX", "VDN", "IQL", "COMA", "MAPPO", "IPPO", "MADDPG", "RHMC, other")

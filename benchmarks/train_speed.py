@@ -19,10 +19,10 @@ import env_speed
 from torch.profiler import ProfilerActivity, profile
 
 import rhmc
-from pipelines.study import Setting, Study
+from pipelines.specs.study import Setting, Study
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import EnvConfig, coverage, navigation
-from rhmc.trainer import Config, Trainer
+from rhmc.training.trainer import Config, Trainer
 
 SETTINGS = (("paper", "mlp"), ("extended", "pairwise"))  # observation, encoder
 TASKS = ("coverage", "navigation")

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from rhmc.envs import coverage
-from rhmc.nets import ENCODERS, Sizes
+from rhmc.networks.nets import ENCODERS, Sizes
 from rhmc.types import Obs
 
 BATCHES = (64, 128, 256, 512, 1024)
@@ -22,7 +22,7 @@ ACTIONS = 3
 
 
 def critic() -> nn.Module:
-    """The executors' critic as `rhmc.executor` builds it."""
+    """The executors' critic as `rhmc.hierarchy.executor` builds it."""
     return ENCODERS["pairwise"].central(SIZES, 64, ACTIONS, joint=ACTIONS)
 
 

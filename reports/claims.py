@@ -16,11 +16,11 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from reports.escape import markdown
-from reports.frame import ERRORS, FINAL, THEOREM, YARDSTICKS, Results
-from reports.paper import Paper, PaperError
-from reports.stats import FEW, Interval, change, difference, interval
-from reports.tables import NONE, Table, estimate, joined, number, percent, steps
+from reports.data.escaping import markdown
+from reports.data.frame import ERRORS, FINAL, THEOREM, YARDSTICKS, Results
+from reports.data.paper import Paper, PaperError
+from reports.data.stats import FEW, Interval, change, difference, interval
+from reports.render.tables import NONE, Table, estimate, joined, number, percent, steps
 
 Verdict = Literal["reproduced", "partly", "not reproduced", "untestable", "contradicted by the paper itself"]
 VERDICTS: tuple[str, ...] = get_args(Verdict)
@@ -443,9 +443,9 @@ def command(study: str, profile: str) -> str:
     """What makes a study's numbers, and the report from them, again. The study is named as its table is."""
     report = f"rhmc report --profile {profile}"
     if study == THEOREM:
-        return f"rhmc theorem --out reports/{profile}/runs && {report}"
+        return f"rhmc theorem --out results/{profile}/runs && {report}"
     if study == YARDSTICKS:
-        return f"rhmc yardsticks all --profile {profile} --out reports/{profile}/runs && {report}"
+        return f"rhmc yardsticks all --profile {profile} --out results/{profile}/runs && {report}"
     file, _, variant = study.partition("@")
     which = f"studies/{file}.yaml --profile {profile}" + (f" --variant {variant}" if variant else "")
     return f"rhmc study run {which} && rhmc export {which} && {report}"

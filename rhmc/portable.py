@@ -1,10 +1,10 @@
 """Settings under which torch computes the same bytes on every x86-64 processor with AVX2 and FMA.
 
 torch and the libraries below it choose instructions by the processor that they find, and other instructions round
-otherwise. Here they are told to use those that all such processors have; products of layers are `rhmc.linear`'s, which
-need no setting. `Tensor.sqrt` is left out of `rhmc`: MKL's differs all the same. They read the settings at their first
-operation, so importing `rhmc` before anything is computed is enough. What was compared, and where:
-`docs/reproducibility.md`.
+otherwise. Here they are told to use those that all such processors have; products of layers are those of
+`rhmc.networks.linear`, which need no setting. `Tensor.sqrt` is left out of `rhmc`: MKL's differs all the same. They
+read the settings at their first operation, so importing `rhmc` before anything is computed is enough. What was
+compared, and where: `docs/reproducibility.md`.
 """
 
 import os
@@ -13,8 +13,8 @@ from pathlib import Path
 
 SETTINGS = {
     "ATEN_CPU_CAPABILITY": "avx2",  # torch's own kernels: exp, tanh, softmax
-    "MKL_CBWR": "COMPATIBLE",  # functions of arrays, and products of matrices other than those of `rhmc.linear`
-    "ONEDNN_DEFAULT_FPMATH_MODE": "STRICT",  # products of `rhmc.linear`: no numbers of fewer bits
+    "MKL_CBWR": "COMPATIBLE",  # functions of arrays, and products of matrices outside `rhmc.networks.linear`
+    "ONEDNN_DEFAULT_FPMATH_MODE": "STRICT",  # products of `rhmc.networks.linear`: no numbers of fewer bits
 }
 CAPABILITY = "AVX2"  # what torch then says of itself
 CPUINFO = Path("/proc/cpuinfo")

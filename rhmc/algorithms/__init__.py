@@ -1,4 +1,4 @@
-"""The methods, a page each, which registers itself: importing this package fills `ALGORITHMS`.
+"""The methods, a page each, which registers itself as this package is imported; no task and no training loop.
 
 There is nothing here but imports, so that a new page changes the code of no other method.
 """

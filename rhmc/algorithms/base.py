@@ -5,7 +5,7 @@ from typing import Any, Literal, NamedTuple, Protocol
 
 from torch import Generator, Tensor
 
-from rhmc.learner import Learners
+from rhmc.learning.learner import Learners
 from rhmc.registry import register
 from rhmc.types import Batch, Carry, Obs, State, Transition
 

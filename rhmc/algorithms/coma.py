@@ -18,15 +18,15 @@ from pydantic import Field
 from torch import Generator, Tensor
 from torch.nn.functional import mse_loss, one_hot
 
-from rhmc import checkpoint
 from rhmc.algorithms.base import About, Method, register_method
-from rhmc.experience import Rollout, ends, flat, minibatches
-from rhmc.learner import Learner, Learners, taken, unpack
-from rhmc.nets import ENCODERS, Sizes, team
-from rhmc.returns import td_lambda
-from rhmc.sampling import mix
-from rhmc.settings import OnPolicy, Slow, Standardised
-from rhmc.standardise import Standard
+from rhmc.learning import checkpoint
+from rhmc.learning.experience import Rollout, ends, flat, minibatches
+from rhmc.learning.learner import Learner, Learners, taken, unpack
+from rhmc.learning.normalisation import Standard
+from rhmc.learning.returns import td_lambda
+from rhmc.learning.settings import OnPolicy, Slow, Standardised
+from rhmc.networks.nets import ENCODERS, Sizes, team
+from rhmc.networks.sampling import mix
 from rhmc.types import Batch, Carry, Obs, Spec, State, Transition
 
 ABOUT = About(
@@ -48,7 +48,8 @@ class Config(Slow, Standardised, OnPolicy):
     polyak: float = Field(0.98, ge=0, le=1, description="share of the slow critic kept per update")
     gamma: float = Field(0.95, ge=0, le=1)
     standardise: Literal["none", "reward", "return"] = Field(
-        "return", description="learn from rewards, or predict returns, of mean 0 and deviation 1 (`rhmc.standardise`)"
+        "return",
+        description="learn from rewards, or predict returns, of mean 0 and deviation 1 (`rhmc.learning.normalisation`)",
     )
     rollout: int = Field(10, ge=1, description="steps of each environment between updates")
     entropy: float = Field(0.03, ge=0, description="weight of the policy's entropy")

@@ -3,10 +3,10 @@
 Source: Xu et al. 2020, section 3: executors paid by the targets assigned to them; a coordinator with attention over all
 pairs, whose critic adds up the pairs' approximate marginal contributions, holds an assignment for 10 steps and learns
 from the team's reward.
-Departures: the executors are those of `rhmc.executor` (off-policy, a central critic) instead of A3C, under assignments
-drawn at random (`practice`), within the run's budget (`pretrain`). Synchronous instead of A3C: rollouts of all
-environments, several epochs on each with every pair's ratio of probabilities clipped (`epochs: 1, minibatches: 1` is
-the plain actor-critic), normalised advantages, predicted returns standardised. A period that an episode cuts short
+Departures: the executors are those of `rhmc.hierarchy.executor` (off-policy, a central critic) instead of A3C, under
+assignments drawn at random (`practice`), within the run's budget (`pretrain`). Synchronous instead of A3C: rollouts of
+all environments, several epochs on each with every pair's ratio of probabilities clipped (`epochs: 1, minibatches: 1`
+is the plain actor-critic), normalised advantages, predicted returns standardised. A period that an episode cuts short
 counts for the steps it had. A pair's contribution is judged from the mean of those before it, not by attention over
 them; its order is drawn, not fixed. Truncation bootstraps.
 """
@@ -17,11 +17,12 @@ import torch
 from pydantic import Field
 from torch import Generator, Tensor
 
-from rhmc import attention, checkpoint, executor
 from rhmc.algorithms.base import About, Method, register_method
-from rhmc.experience import Experience
-from rhmc.learner import Learners, Replay, choose, pack
-from rhmc.settings import OffPolicy
+from rhmc.hierarchy import attention, executor
+from rhmc.learning import checkpoint
+from rhmc.learning.experience import Experience
+from rhmc.learning.learner import Learners, Replay, choose, pack
+from rhmc.learning.settings import OffPolicy
 from rhmc.types import Batch, Carry, Obs, Spec, State, Transition
 
 ABOUT = About(
@@ -40,7 +41,9 @@ class Config(attention.Config, executor.Config, OffPolicy):
     """Settings; those of the coordinator are the source's."""
 
     kind: Literal["hitmac"] = "hitmac"
-    executor: Literal["gumbel", "expected"] = Field("expected", description="actor's gradient, as in `rhmc.executor`")
+    executor: Literal["gumbel", "expected"] = Field(
+        "expected", description="actor's gradient, as in `rhmc.hierarchy.executor`"
+    )
     pretrain: int = Field(500_000, ge=0, description="environment steps in which the executors learn")
 
 

@@ -8,7 +8,7 @@ from typing import Literal
 
 from torch import Generator
 
-from rhmc import ppo
+from rhmc.algorithms import ppo
 from rhmc.algorithms.base import About, Method, register_method
 from rhmc.types import Spec
 

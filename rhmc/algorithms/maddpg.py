@@ -17,14 +17,14 @@ from pydantic import Field
 from torch import Generator, Tensor
 from torch.nn.functional import mse_loss
 
-from rhmc import checkpoint
 from rhmc.algorithms.base import About, Method, register_method
-from rhmc.experience import Experience
-from rhmc.heads import Continuous, Discrete, Head
-from rhmc.learner import Learner, Learners, pack_step, unpack
-from rhmc.nets import ENCODERS, Sizes, team
-from rhmc.settings import OffPolicy, Slow, Standardised
-from rhmc.standardise import Standard
+from rhmc.learning import checkpoint
+from rhmc.learning.experience import Experience
+from rhmc.learning.learner import Learner, Learners, pack_step, unpack
+from rhmc.learning.normalisation import Standard
+from rhmc.learning.settings import OffPolicy, Slow, Standardised
+from rhmc.networks.heads import Continuous, Discrete, Head
+from rhmc.networks.nets import ENCODERS, Sizes, team
 from rhmc.types import Batch, Carry, Obs, Spec, State, Transition
 
 ABOUT = About(

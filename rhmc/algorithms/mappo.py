@@ -11,7 +11,7 @@ from typing import Literal
 
 from torch import Generator
 
-from rhmc import ppo
+from rhmc.algorithms import ppo
 from rhmc.algorithms.base import About, Method, register_method
 from rhmc.types import Spec
 
@@ -27,7 +27,7 @@ ABOUT = About(
 
 
 class Config(ppo.Config):
-    """Settings; gamma is the paper's, most of the rest the source's (`rhmc.ppo`)."""
+    """Settings; gamma is the paper's, most of the rest the source's (`rhmc.algorithms.ppo`)."""
 
     kind: Literal["mappo"] = "mappo"
 

@@ -12,9 +12,9 @@ from typing import Literal
 from pydantic import Field
 from torch import Generator
 
-from rhmc import qlearning
+from rhmc.algorithms import qlearning
 from rhmc.algorithms.base import About, Method, register_method
-from rhmc.nets import ENCODERS, Sizes
+from rhmc.networks.nets import ENCODERS, Sizes
 from rhmc.types import Spec
 
 ABOUT = About(

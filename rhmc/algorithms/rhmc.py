@@ -1,10 +1,11 @@
 """RHMC: a coordinator assigns targets, executors act on them; a regulated reward and a filter steady the learning.
 
-Source: the RHMC paper, Eq. 6 to 13 and Algorithms 1 and 2; the levels are `rhmc.coordinator` and `rhmc.executor`.
+Source: the RHMC paper, Eq. 6 to 13 and Algorithms 1 and 2; the levels are `rhmc.hierarchy.coordinator` and
+`rhmc.hierarchy.executor`.
 Departures, each a field of `Config`: `coordinator: counterfactual` and `executor: expected` beside the paper's
-gradients; `executor: mixed` instead of actors (`rhmc.mixed`); `regulator: exact` beside Algorithm 1, with a `horizon`;
-an assignment may be held (`assignment_period`); both levels may learn from the team's reward (`high_reward`,
-`low_reward`), each on a scale of its own (`standardise_h`, `standardise_l`).
+gradients; `executor: mixed` instead of actors (`rhmc.hierarchy.mixing_executor`); `regulator: exact` beside Algorithm
+1, with a `horizon`; an assignment may be held (`assignment_period`); both levels may learn from the team's reward
+(`high_reward`, `low_reward`), each on a scale of its own (`standardise_h`, `standardise_l`).
 Eq. 7, 11 and 13 are read with standard signs; truncation bootstraps.
 """
 
@@ -14,12 +15,14 @@ import torch
 from pydantic import Field, model_validator
 from torch import Generator, Tensor
 
-from rhmc import checkpoint, coordinator, executor, mixed
 from rhmc.algorithms.base import About, Method, register_method
-from rhmc.experience import Experience
-from rhmc.learner import Learners, Replay, choose, pack
-from rhmc.regulation import REGULATORS, executed
-from rhmc.settings import OffPolicy
+from rhmc.hierarchy import coordinator, executor
+from rhmc.hierarchy import mixing_executor as mixed
+from rhmc.hierarchy.regulation import REGULATORS, executed
+from rhmc.learning import checkpoint
+from rhmc.learning.experience import Experience
+from rhmc.learning.learner import Learners, Replay, choose, pack
+from rhmc.learning.settings import OffPolicy
 from rhmc.types import Batch, Carry, Obs, Spec, State, Transition
 
 ABOUT = About(

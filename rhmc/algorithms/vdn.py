@@ -9,7 +9,7 @@ from typing import Literal
 
 from torch import Generator, Tensor, nn
 
-from rhmc import qlearning
+from rhmc.algorithms import qlearning
 from rhmc.algorithms.base import About, Method, register_method
 from rhmc.types import Obs, Spec
 

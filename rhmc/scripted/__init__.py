@@ -1,4 +1,4 @@
-"""Policies without learning and bounds, by task and name: the scale on which learned scores are read."""
+"""Policies without learning and bounds, by task and name, as the scale of learned scores; nothing learns here."""
 
 from collections.abc import Callable
 from typing import Any

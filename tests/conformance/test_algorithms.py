@@ -14,9 +14,9 @@ from torch.overrides import TorchFunctionMode
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import ENVS, Task, coverage, make_env, navigation
 from rhmc.envs.base import Env
-from rhmc.learner import Learner, Replay
-from rhmc.nets import Unshared
-from rhmc.trainer import Config, Trainer
+from rhmc.learning.learner import Learner, Replay
+from rhmc.networks.nets import Unshared
+from rhmc.training.trainer import Config, Trainer
 from rhmc.types import Batch, Obs, Transition
 from tests import toy
 from tests.conformance import DifferentError, assert_same

@@ -1,7 +1,7 @@
 """Digests of results that must not change unnoticed: `python -m tests.golden` prints them, `--write` keeps them.
 
-A digest that changes is either another arithmetic, and then `pipelines.arithmetic` names the operations, or a change of
-the code that changes results, which is said in the changelog and ages the runs that it concerns.
+A digest that changes is either another arithmetic, and then `pipelines.workspace.arithmetic` names the operations, or a
+change of the code that changes results, which is said in the changelog and ages the runs that it concerns.
 """
 
 import hashlib
@@ -13,14 +13,14 @@ from typing import Any
 
 from torch import Tensor
 
-from pipelines.export import write_tables
-from pipelines.plan import items, study_card
-from pipelines.study import Setting
-from pipelines.tracker import MemoryTracker
+from pipelines.export.tables import write_tables
+from pipelines.specs.study import Setting
+from pipelines.tracking.plan import items, study_card
+from pipelines.tracking.tracker import MemoryTracker
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import ENVS
-from rhmc.trainer import Trainer
-from rhmc.yardsticks import yardsticks
+from rhmc.scripted.yardsticks import yardsticks
+from rhmc.training.trainer import Trainer
 from tests.pipelines.support import tiny
 
 FILE = Path(__file__).with_name("digests.json")

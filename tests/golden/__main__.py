@@ -5,8 +5,8 @@ import sys
 
 import torch
 
-from pipelines.arithmetic import differing
-from pipelines.host import host
+from pipelines.workspace.arithmetic import differing
+from pipelines.workspace.provenance import host
 from tests.golden import FILE, cases, kept
 
 torch.set_num_threads(1)

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from pipelines.arithmetic import PUBLISHED, differing, operations
+from pipelines.workspace.arithmetic import PUBLISHED, differing, operations
 from rhmc.portable import SETTINGS, active
 from tests.golden import cases, kept
 
@@ -40,7 +40,7 @@ def test_operations_give_the_published_bytes() -> None:
 @pytest.mark.parametrize("least", ["AVX2", "AVX512_CORE"])
 def test_wider_instructions_of_layers_give_the_same_bytes(least: str) -> None:
     """oneDNN takes the widest instructions that it is allowed; a processor without these takes the others."""
-    program = "import rhmc\nfrom pipelines.arithmetic import operations\nprint(operations())"
+    program = "import rhmc\nfrom pipelines.workspace.arithmetic import operations\nprint(operations())"
     narrow = os.environ | {"ONEDNN_MAX_CPU_ISA": least}
     said = subprocess.run([sys.executable, "-c", program], env=narrow, capture_output=True, text=True, check=True)
     assert said.stdout.strip() == str(operations())
@@ -49,11 +49,11 @@ def test_wider_instructions_of_layers_give_the_same_bytes(least: str) -> None:
 # Ways into the program: each has to settle the arithmetic before anything is computed.
 WAYS = {
     "torch first": "import torch\nimport rhmc",
-    "the science": "from rhmc.trainer import Trainer",
-    "studies": "from pipelines.study import Study",
-    "a worker": "from pipelines.trainable import RunTrainable",
-    "a model of MLflow": "from pipelines.served import ServedPolicy",
-    "command line": "import pipelines.cli\nfrom pipelines.evaluation import score",
+    "the science": "from rhmc.training.trainer import Trainer",
+    "studies": "from pipelines.specs.study import Study",
+    "a worker": "from pipelines.execution.trainable import RunTrainable",
+    "a model of MLflow": "from pipelines.tracking.mlflow_model import ServedPolicy",
+    "command line": "import pipelines.cli.main\nfrom pipelines.policies.evaluation import score",
     "benchmark": "import sys\nsys.path.insert(0, 'benchmarks')\nimport train_speed",
     "golden": "import tests.golden",
 }
@@ -62,7 +62,7 @@ WAYS = {
 @pytest.mark.parametrize("way", WAYS)
 def test_the_arithmetic_is_settled_however_one_comes_in(way: str) -> None:
     """Also where somebody has set something else before."""
-    program = f"{WAYS[way]}\nfrom pipelines.arithmetic import operations\nprint(operations())"
+    program = f"{WAYS[way]}\nfrom pipelines.workspace.arithmetic import operations\nprint(operations())"
     hostile = dict.fromkeys(SETTINGS, "default") | {
         "MKL_CBWR": "AVX2",
         "ONEDNN_DEFAULT_FPMATH_MODE": "BF16",

@@ -1,4 +1,5 @@
-"""Slow, readable twins of `rhmc.regulation`, on nested lists: options[i][d][j], assignment[i][j], one instance."""
+"""Slow, readable twins of `rhmc.hierarchy.regulation`, on nested lists: options[i][d][j], assignment[i][j], one
+instance."""
 
 from collections.abc import Iterator
 from itertools import product

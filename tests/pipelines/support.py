@@ -12,10 +12,10 @@ from typing import Any
 import psutil
 import pytest
 
-from pipelines.identity import code_id
-from pipelines.plan import Item, items
-from pipelines.side_by_side import side_by_side
-from pipelines.study import Resources, RunSpec, Setting, Study
+from pipelines.specs.identity import code_id
+from pipelines.specs.study import Resources, RunSpec, Setting, Study
+from pipelines.tracking.plan import Item, items
+from pipelines.workspace.process_pool import side_by_side
 
 CODE = code_id("iql", "coverage")  # of all runs here
 
@@ -100,6 +100,6 @@ def interrupt(home: Path) -> None:
 
 
 if __name__ == "__main__":
-    from pipelines import run
+    from pipelines.execution import run
 
     sys.exit(run.run_studies([tiny(points=int(sys.argv[2]), concurrent=int(sys.argv[3]))], Path(sys.argv[1])))

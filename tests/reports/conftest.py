@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 from matplotlib.figure import Figure
 
-from reports import stats
-from reports.build import build
+from reports.data import stats
+from reports.pages.build import build
 from tests.reports.factory import drawings, episode, half_done, methods, noisy, study, theorem, write, yardsticks
 
 

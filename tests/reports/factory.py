@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from reports.frame import METHOD, METHODS, OWN, PLACE, POINTS, RUNS
+from reports.data.frame import METHOD, METHODS, OWN, PLACE, POINTS, RUNS
 
 COVERAGE = {"kind": "coverage", "preset": "flat", "agents": 4, "targets": 5, "observation": "extended"}
 NAVIGATION = {"kind": "navigation", "agents": 3, "reward": "paper"}

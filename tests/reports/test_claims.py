@@ -7,9 +7,9 @@ import pandas as pd
 import pytest
 
 from reports.claims import Claim, judge
-from reports.frame import load
-from reports.paper import read
-from reports.stats import Interval
+from reports.data.frame import load
+from reports.data.paper import read
+from reports.data.stats import Interval
 from tests.reports.factory import COVERAGE, NAVIGATION, Tables, noisy, study, theorem, write, yardsticks
 
 pytestmark = pytest.mark.usefixtures("quick_resampling")

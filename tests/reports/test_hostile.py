@@ -15,11 +15,14 @@ from matplotlib.font_manager import FontProperties
 from matplotlib.legend import Legend
 from matplotlib.text import Text
 
-from reports import beyond, comparison, escape, figures, letters, scaling
-from reports.build import Built, build
-from reports.canvas import Drawing, blank, save, styled
-from reports.frame import Results, load
-from reports.paper import read
+from reports.analyses import beyond, comparison, scaling
+from reports.data import escaping as escape
+from reports.data.frame import Results, load
+from reports.data.paper import read
+from reports.pages.build import Built, build
+from reports.render import figures
+from reports.render import glyphs as letters
+from reports.render.canvas import Drawing, blank, save, styled
 from tests.reports.factory import COVERAGE, assignments, noisy, study, write, yardsticks
 from tests.reports.hostile import NAMES, QUESTION, Page, csv_words, latex_rows, markdown_words
 

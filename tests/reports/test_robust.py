@@ -17,10 +17,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from reports import build as report
-from reports import diagrams, figures, gallery, paper, tables
-from reports.build import build, main
-from reports.frame import TableError, load
+from reports.data import paper
+from reports.data.frame import TableError, load
+from reports.pages import build as report
+from reports.pages import gallery
+from reports.pages.build import build, main
+from reports.render import diagrams, figures, tables
 from tests.reports.factory import drawings, episode, methods, noisy, study, write, yardsticks
 from tests.reports.hostile import Page
 
@@ -314,7 +316,7 @@ def test_evidence_that_fails_is_an_error(
 
 def test_what_a_killed_report_left_is_swept(tmp_path: Path) -> None:
     runs, out = fresh(tmp_path / "runs"), tmp_path / "out"
-    call = [sys.executable, "-m", "reports.build", "--runs", str(runs), "--out", str(out), "--study", "reach"]
+    call = [sys.executable, "-m", "reports.pages.build", "--runs", str(runs), "--out", str(out), "--study", "reach"]
     child = subprocess.Popen(call, cwd=Path(__file__).parents[2], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     end = time.monotonic() + 120
     while not list(out.glob(".report-*/figures/*")) and child.poll() is None and time.monotonic() < end:
@@ -357,7 +359,7 @@ def test_no_place_for_tables(name: str, words: str, tmp_path: Path) -> None:
 def test_nothing_depends_on_the_locale(tmp_path: Path) -> None:
     runs, out = write(tmp_path / "runs", study("reach", {"基线": noisy(60)}, points=2)), tmp_path / "out"
     env = os.environ | {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
-    call = [sys.executable, "-m", "reports.build", "--runs", str(runs), "--out", str(out), "--study", "reach"]
+    call = [sys.executable, "-m", "reports.pages.build", "--runs", str(runs), "--out", str(out), "--study", "reach"]
     done = subprocess.run(call, cwd=Path(__file__).parents[2], env=env, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert "基线" in (out / "index.html").read_text(encoding="utf-8")

@@ -1,0 +1,150 @@
+"""What the verbs share: options, reading a study, printing. Imports nothing heavy."""
+
+import json
+import sys
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pipelines.specs.safe_names import PROFILES
+from pipelines.workspace.errors import InputError, visible, visible_lines
+
+if TYPE_CHECKING:
+    from pipelines.specs.study import Study
+
+DONE, UNFINISHED, BAD, INTERRUPTED = 0, 1, 2, 130  # exit codes
+WIDTH = 140  # columns of a table that is not shown on a terminal
+
+SET_HELP = (
+    "Change the study: KEY=VALUE, KEY a dotted path of its file, VALUE read as YAML (seeds=1, steps=1e5, "
+    "base.algo.lr=1e-3, arms.full.env.agents=6, grid.algo.alpha=[0,0.1]). env., algo. and trainer. stand for "
+    "base.env., base.algo. and base.trainer., and trainer.steps for steps. Merged as an arm is into the base. It goes "
+    "before what a profile changes in the base; an arm keeps what it states itself, or the profile for it. Can be "
+    "given several times."
+)
+
+
+def files_in(folder: str, pattern: str, incomplete: str) -> list[str]:
+    """Completion of a file, in the folder where they usually are."""
+    return [str(p) for p in sorted(Path(folder).glob(pattern)) if str(p).startswith(incomplete)]
+
+
+def _studies(incomplete: str) -> list[str]:
+    return files_in("studies", "*.yaml", incomplete)
+
+
+def _profiles(incomplete: str) -> list[str]:
+    return [name for name in PROFILES if name.startswith(incomplete)]
+
+
+File = Annotated[
+    Path, typer.Argument(metavar="FILE", help="A study, such as studies/ablation.yaml.", autocompletion=_studies)
+]
+Files = Annotated[list[Path], typer.Argument(metavar="FILE...", help="Studies.", autocompletion=_studies)]
+Profile = Annotated[str, typer.Option(help="The budget: quick or paper.", autocompletion=_profiles)]
+Variant = Annotated[str | None, typer.Option(help="One of the file's variants, which changes every arm.")]
+Sets = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help=SET_HELP)]
+Json = Annotated[bool, typer.Option("--json", help="JSON on stdout instead of a table.")]
+
+
+def load_study(file: Path, profile: str, overrides: Sequence[str] | None, variant: str | None) -> "Study":
+    """The study that the options name.
+
+    Raises:
+        InputError: with every fault.
+    """
+    from pipelines.specs.study import Study
+
+    return Study.load(file, profile, overrides or [], variant)
+
+
+def load_studies(
+    files: Sequence[Path], profile: str, overrides: Sequence[str] | None, variant: str | None
+) -> "list[Study]":
+    """The studies that the options name, all of which take the same options.
+
+    Raises:
+        InputError: with every fault of all of them.
+    """
+    studies: list[Study] = []
+    faults: dict[Path, list[str]] = {}
+    for file in files:
+        try:
+            studies.append(load_study(file, profile, overrides, variant))
+        except InputError as error:
+            faults[file] = [str(line) for line in error.args]
+    if faults:
+        raise InputError(*_of_files(faults, len(set(files))))
+    return studies
+
+
+def _of_files(faults: Mapping[Path, Sequence[str]], files: int) -> list[str]:
+    """The faults of several files: one of an option is said once if all have it, else it names the file."""
+    counts = Counter(line for lines in faults.values() for line in lines)
+    return list(
+        dict.fromkeys(
+            f"{file}: {line}" if line.startswith("--") and counts[line] < files else line
+            for file, lines in faults.items()
+            for line in lines
+        )
+    )
+
+
+@contextmanager
+def folder_option(out: Path | None) -> Iterator[None]:
+    """Work with the folder that `--out` names, if any: what is wrong with it is bad input.
+
+    Raises:
+        InputError: it is a file, or cannot be written to.
+    """
+    from pipelines.workspace.work_folder import StoreError
+
+    if out is not None and out.exists() and not out.is_dir():
+        raise InputError(f"--out: {out} is not a folder")
+    try:
+        yield
+    except StoreError as error:
+        raise InputError(str(error)) from error
+
+
+def profile_faults(profile: str) -> list[str]:
+    """What is wrong with `--profile`, for verbs that read no study."""
+    from pipelines.specs.document import choices, show
+
+    return [] if profile in PROFILES else [f"--profile: {show(profile)} is not allowed; {choices(profile, PROFILES)}"]
+
+
+def say(text: str) -> None:
+    """Lines on stdout, at once."""
+    print(visible_lines(text), flush=True)
+
+
+def tell(text: str) -> None:
+    """A line on stderr, at once."""
+    print(visible(text), file=sys.stderr, flush=True)
+
+
+def say_json(value: Any) -> None:
+    """One JSON value on stdout, on a line of its own; what cannot be seen stays as JSON's escapes."""
+    text = json.dumps(value, ensure_ascii=False)
+    print(text if visible(text) == text else json.dumps(value), flush=True)
+
+
+def table(columns: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[str] = ()) -> None:
+    """A table on stdout; `numbers` are the columns that stand to the right."""
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    from pipelines.workspace.terminal import terminal
+
+    drawn = Table(box=box.SIMPLE)
+    for column in columns:
+        drawn.add_column(Text(column), justify="right" if column in numbers else "left", overflow="fold")
+    for row in rows:
+        drawn.add_row(*(Text(visible(cell)) for cell in row))
+    terminal(None if sys.stdout.isatty() else WIDTH).print(drawn)

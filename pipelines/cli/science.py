@@ -1,0 +1,121 @@
+"""Verbs that describe the code: Theorem 1, the methods, the fingerprint; and the report from what was exported."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipelines.cli.common import Profile, folder_option, profile_faults, say, table, tell
+from pipelines.specs.limits import EPISODES, SEED
+from pipelines.specs.safe_names import PROFILES, fault_of_study, simple, study_name
+from pipelines.workspace.errors import InputError, visible_lines
+from pipelines.workspace.files import fault_of, regular
+
+
+def theorem(
+    instances: Annotated[
+        int, typer.Option(min=1, max=EPISODES, help="Random instances per size and density.")
+    ] = 20_000,
+    seed: Annotated[int, typer.Option(min=0, max=SEED)] = 0,
+    alpha: Annotated[float, typer.Option(min=0, max=1, help="The penalty of Eq. 6.")] = 0.1,
+    out: Annotated[Path | None, typer.Option(help="Also write theorem.parquet in this folder.")] = None,
+) -> None:
+    """Put Theorem 1 to the test: Algorithm 1 against the optimum, and the smallest instances where it fails."""
+    from pipelines.export.theorem import export_theorem
+    from rhmc.hierarchy.theorem import shortfall_table, summary
+
+    with folder_option(out):
+        found = shortfall_table(instances, seed, alpha=alpha)
+        print(summary(found, alpha))
+        if out is not None:
+            tell(f"wrote {export_theorem(found, seed, out)}")
+
+
+def methods(out: Annotated[Path | None, typer.Option(help="Also write methods.json in this folder.")] = None) -> None:
+    """Say what every method is (Table 1), with the parameters of the networks that it builds."""
+    from pipelines.export.methods import describe, export_methods
+
+    with folder_option(out):
+        found = describe()
+        rows = [
+            [m["name"], m["source"], m["family"], m["training"], m["execution"], ", ".join(m["actions"])]
+            + [f"{size['acting']:,} of {size['all']:,}" for size in m["parameters"]]
+            for m in found
+        ]
+        counted = [f"{size['task']['kind']}, {size['encoder']}" for size in found[0]["parameters"]]
+        table(["method", "source", "family", "training", "execution", "actions", *counted], rows, numbers=counted)
+        if out is not None:
+            tell(f"wrote {export_methods(out)}")
+
+
+def fingerprint(file: Annotated[Path | None, typer.Argument(help="Write it there, if it differs.")] = None) -> None:
+    """Name the code that decides results: the same after editing a comment, another after editing behaviour."""
+    from pipelines.specs.identity import fingerprint as of_code
+
+    text = of_code() + "\n"
+    if file is None:
+        print(text, end="")
+        return
+    try:
+        if not file.exists() or regular(file).read_bytes() != text.encode():
+            file.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{file}: cannot be written ({error.strerror})") from error
+
+
+def profile(
+    file: Annotated[Path, typer.Argument(help="Where it stands, as `profile: quick`.")] = Path("params.yaml"),
+) -> None:
+    """Print the profile that the pipeline runs on, or say why there is none: its name goes into paths and commands."""
+    from pipelines.specs.document import choices, read, show
+
+    root, faults = read(file)
+    written = root.children.get("profile") if root else None
+    if faults:
+        raise InputError(*map(str, faults))
+    if written is None:
+        raise InputError(f"{file}: profile: missing; {choices('', PROFILES)}")
+    if written.value not in PROFILES:
+        raise InputError(f"{written.place}: profile: {show(written.value)} is not allowed; {choices('', PROFILES)}")
+    say(str(written.value))
+
+
+def drawings(
+    out: Annotated[Path, typer.Option(help="Folder; made if it is not there.")] = Path("results/quick/runs"),
+) -> None:
+    """Write what Figures 1 to 5 and 8 show: RHMC's networks as they run, and states of both tasks."""
+    from pipelines.export.drawings import export_drawings
+
+    with folder_option(out):
+        for file in export_drawings(out):
+            tell(f"wrote {file}")
+
+
+def report(
+    profile: Profile = "quick",
+    study: Annotated[Path | None, typer.Option(metavar="FILE", help="Report on this study alone.")] = None,
+    variant: Annotated[str | None, typer.Option(help="Of that study.")] = None,
+    runs: Annotated[Path | None, typer.Option(help="Exported tables; results/<profile>/runs if not given.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder; results/<profile>, with study/<name> after it for one study, if not given."),
+    ] = None,
+) -> None:
+    """Build figures, tables, claims and their page from the exported tables; or curves and comparison of one study."""
+    if faults := profile_faults(profile):
+        raise InputError(*faults)
+    if study is not None and (fault := fault_of(study)):
+        raise InputError(f"--study: {study}: {fault}; a study such as studies/ablation.yaml")
+    if variant is not None and study is None:
+        raise InputError("--variant: belongs to a study; give --study as well")
+    if study is not None and (fault := fault_of_study(study_name(study))):
+        raise InputError(f"--study: {study}: {fault}")
+    if variant is not None and not simple(variant):
+        raise InputError(f"--variant: {variant!r} is not allowed; letters, digits, '-' and '_' only")
+    from reports.pages.build import main as build
+
+    arguments = ["--profile", profile]
+    arguments += ["--study", study_name(study, variant or "")] if study else []
+    arguments += ["--runs", str(runs)] if runs else []
+    arguments += ["--out", str(out)] if out else []
+    raise typer.Exit(build(arguments, visible_lines))

@@ -1,0 +1,75 @@
+"""`rhmc search`: check, run and follow searches."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pipelines.cli.common import Profile, files_in, folder_option, say
+
+if TYPE_CHECKING:
+    from pipelines.specs.search import Search
+
+File = Annotated[
+    Path,
+    typer.Argument(
+        metavar="FILE",
+        help="A search, such as studies/search_rhmc.yaml.",
+        autocompletion=lambda incomplete: files_in("studies", "search_*.yaml", incomplete),
+    ),
+]
+Sets = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Change the search, as in a study: trials=4, base.algo.lr=1e-3."),
+]
+Out = Annotated[
+    Path | None,
+    typer.Option(help="Folder for the winners; `found` beside FILE if not given, the work folder with --set."),
+]
+
+app = typer.Typer(help="Search settings with the same budget for every method.", no_args_is_help=True)
+
+
+@app.command("check")
+def check(file: File, profile: Profile = "quick", overrides: Sets = None) -> None:
+    """Say what a search would try, or everything that is wrong with it. Starts nothing."""
+    search = _search(file, profile, overrides)
+    say(f"{search.name} ({search.profile}): {search.question}")
+    for name, arm in search.arms.items():
+        say("\n".join([f"{name}: {arm.setting.algo.kind}", *(f"  {key}: {one}" for key, one in arm.space.items())]))
+    each = search.trials * search.seeds
+    say(
+        f"each arm: {search.trials} trials x {search.seeds} seeds x {search.steps:,} environment steps, "
+        f"{each * search.steps:,} in all; sampler {search.sampler.kind}, pruner {search.pruner.kind}, "
+        f"{search.resources.concurrent} trials at a time"
+    )
+    for remark in search.remarks:
+        say(f"note: {remark}")
+
+
+@app.command("run")
+def run(file: File, profile: Profile = "quick", overrides: Sets = None, out: Out = None) -> None:
+    """Try what a search still lacks. Finished trials are kept, interrupted ones continue; the winners are written."""
+    search = _search(file, profile, overrides)
+    from pipelines.tuning.search_run import run_search
+    from pipelines.workspace.work_folder import work_folder
+
+    with folder_option(out):
+        raise typer.Exit(run_search(search, work_folder(), out))
+
+
+@app.command("status")
+def status(file: File, profile: Profile = "quick", overrides: Sets = None) -> None:
+    """Say how many trials are done, pruned, failed or missing, and what is best. Exit code 1 if any is left."""
+    search = _search(file, profile, overrides)
+    from pipelines.tuning.search_run import show_search
+    from pipelines.workspace.work_folder import work_folder
+
+    raise typer.Exit(show_search(search, work_folder()))
+
+
+def _search(file: Path, profile: str, overrides: Sequence[str] | None) -> "Search":
+    from pipelines.specs.search import Search
+
+    return Search.load(file, profile, overrides or [])

@@ -1,0 +1,227 @@
+"""`rhmc study`: check, run, follow and move studies; `rhmc export` for the report."""
+
+import shlex
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from pipelines.cli.common import (
+    BAD,
+    DONE,
+    UNFINISHED,
+    File,
+    Files,
+    Json,
+    Profile,
+    Sets,
+    Variant,
+    load_studies,
+    load_study,
+    say,
+    say_json,
+    table,
+    tell,
+)
+from pipelines.workspace.errors import InputError
+from pipelines.workspace.files import regular
+
+app = typer.Typer(help="Check, run, follow and move studies.", no_args_is_help=True)
+
+
+@app.command("check")
+def check(file: File, profile: Profile = "quick", variant: Variant = None, overrides: Sets = None) -> None:
+    """Say what a study would run, or everything that is wrong with it. Starts nothing."""
+    from pipelines.specs.source_file import another
+    from pipelines.specs.study import changes
+    from pipelines.workspace.work_folder import Home, work_folder
+
+    study = load_study(file, profile, overrides, variant)
+    rows = []
+    for arm, setting in study.arms.items():
+        differs = ", ".join(f"{key}={value}" for key, value in changes(study.base, setting).items()) or "the base"
+        rows.append([arm, differs, str(study.seeds), f"{study.steps:,}", str(setting.trainer.num_envs)])
+    say(f"{study.name} ({study.profile}): {study.question}")
+    if remark := another(Home(work_folder()), study.name, study.profile, study.file):
+        say(remark)
+    table(["arm", "differs in", "seeds", "steps", "copies"], rows, numbers=("seeds", "steps", "copies"))
+    runs = len(study.arms) * study.seeds
+    say(f"{runs} runs, {runs * study.steps:,} environment steps in all, {study.resources.concurrent} runs at a time")
+    for remark in study.remarks:
+        say(f"note: {remark}")
+
+
+@app.command("run")
+def run(files: Files, profile: Profile = "quick", variant: Variant = None, overrides: Sets = None) -> None:
+    """Run what studies still lack. Finished runs are skipped, interrupted ones continue.
+
+    Several files are one queue: what they share is trained once.
+    """
+    studies = load_studies(files, profile, overrides, variant)
+    from pipelines.execution.run import run_studies
+    from pipelines.workspace.work_folder import work_folder
+
+    raise typer.Exit(run_studies(studies, work_folder()))
+
+
+@app.command("status")
+def status(
+    file: File, profile: Profile = "quick", variant: Variant = None, as_json: Json = False, overrides: Sets = None
+) -> None:
+    """Say how many runs are finished, under way, missing or stale (made by other code). Exit code 1 if any is left."""
+    study = load_study(file, profile, overrides, variant)
+    from pipelines.execution.run import show_status
+    from pipelines.workspace.work_folder import work_folder
+
+    raise typer.Exit(show_status(study, work_folder(), as_json=as_json))
+
+
+@app.command("list")
+def list_(
+    folder: Annotated[Path, typer.Option(help="Where the studies are.")] = Path("studies"), as_json: Json = False
+) -> None:
+    """List the studies of a folder with their questions and variants."""
+    files = sorted(folder.glob("*.yaml"))
+    if not files:
+        raise InputError(f"{folder}: no studies (*.yaml) here; `rhmc study copy NAME` writes one of this package")
+    found = [one for file in files if (one := _listed(file))]
+    if as_json:
+        say_json(found)
+        return
+    rows = [[one["study"], one["question"] or one["fault"], ", ".join(one["variants"])] for one in found]
+    table(["study", "question", "variants"], rows)
+
+
+def _listed(file: Path) -> dict[str, Any] | None:
+    """What there is to say of a study; None for a search, which has a space in an arm."""
+    from pipelines.specs.document import read
+
+    root, faults = read(file)
+    nodes = root.children if root else {}
+    if "arms" in nodes and any("space" in arm.children for arm in nodes["arms"].children.values()):
+        return None
+    question = " ".join(str(nodes["question"].value).split()) if "question" in nodes else ""
+    fault = "" if question else str(faults[0]) if faults else "no question"
+    variants = list(nodes["variants"].children) if "variants" in nodes else []
+    return {"study": str(file), "question": question, "variants": variants, "fault": fault}
+
+
+@app.command("copy")
+def copy_shipped(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Of a study of this package, such as coverage.")],
+    out: Annotated[Path, typer.Option(help="Folder; made if it is not there.")] = Path("studies"),
+) -> None:
+    """Write a study of this package into a folder, with what it includes: where there is no checkout."""
+    from pipelines.specs.shipped import copy
+    from pipelines.workspace.work_folder import StoreError
+
+    try:
+        for path in copy(name, out):
+            say(str(path))
+    except StoreError as error:
+        raise InputError(str(error)) from error
+
+
+@app.command("export")
+def export_runs(
+    file: File,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="A new folder, or a new archive if it ends with .zip.")],
+    profile: Profile = "quick",
+    variant: Variant = None,
+    overrides: Sets = None,
+    values_only: Annotated[
+        bool, typer.Option("--values-only", help="Leave policies and checkpoints behind: small enough for git.")
+    ] = False,
+) -> None:
+    """Pack a study's finished runs, and the checkpoints of those under way, for another machine."""
+    study = load_study(file, profile, overrides, variant)
+    from pipelines.bundles.bundle import pack
+    from pipelines.workspace.work_folder import StoreError, work_folder
+
+    try:
+        packed = pack(study, out, work_folder(), values_only=values_only)
+    except StoreError as error:
+        raise InputError(str(error)) from error
+    say(f"{out}: {packed.finished} of {packed.planned} runs finished, {packed.begun} under way")
+    for line in packed.astray:
+        print(f"left out, for it went astray: {line}", file=sys.stderr)
+    say(f"there:  rhmc study import {out.name}")
+
+
+@app.command("import")
+def import_runs(
+    bundle: Annotated[Path, typer.Argument(metavar="BUNDLE", help="What `rhmc study export` wrote.")],
+) -> None:
+    """Take in runs from another machine: `rhmc study run` then goes on from there."""
+    if not bundle.is_dir():
+        regular(bundle)
+    from pipelines.bundles.bundle import unpack
+    from pipelines.workspace.work_folder import StoreError, work_folder
+
+    try:
+        taken = unpack(bundle, work_folder())
+    except StoreError as error:
+        raise InputError(str(error)) from error
+    say(
+        f"{taken.study} ({taken.profile}): {taken.new} finished runs taken in, {taken.known} were here before, "
+        f"{taken.begun} to be continued"
+    )
+    if taken.foreign:
+        say(f"{taken.foreign} of them were made by other code: `rhmc study run` would train them again")
+        say("`rhmc study adopt FILE` lets them count where trainings of today repeat them bit for bit")
+
+
+@app.command("adopt")
+def adopt_runs(
+    files: Files,
+    profile: Profile = "quick",
+    variant: Variant = None,
+    verify: Annotated[int, typer.Option(min=1, metavar="K", help="Runs of each arm that are trained again.")] = 1,
+    until: Annotated[
+        int | None, typer.Option(min=1, metavar="STEP", help="To this step; whole runs without it.")
+    ] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Trainings at a time.")] = 2,
+    overrides: Sets = None,
+) -> None:
+    """Let finished runs of other code count for the code here, where trainings of today repeat them bit for bit.
+
+    Exit code 1 if an arm is refused: the first value that differs is named, and its runs stay as they are.
+    """
+    from pipelines.execution.adoption import adopt
+    from pipelines.workspace.work_folder import work_folder
+
+    refused = False
+    for study in load_studies(files, profile, overrides, variant):
+        say(f"{study.name} ({study.profile})")
+        proofs = adopt(study, work_folder(), verify, until, jobs, say)
+        refused = refused or any(proof.difference for proof in proofs)
+    raise typer.Exit(UNFINISHED if refused else DONE)
+
+
+def export(
+    files: Files,
+    profile: Profile = "quick",
+    variant: Variant = None,
+    out: Annotated[Path | None, typer.Option(help="Folder; results/<profile>/runs if not given.")] = None,
+    overrides: Sets = None,
+) -> None:
+    """Write each study's results as one tidy table, with tables of its runs and how they were made, for the report."""
+    studies = load_studies(files, profile, overrides, variant)
+    from pipelines.export.tables import export_study
+    from pipelines.tracking.plan import given_twice
+
+    if faults := given_twice(studies):
+        raise InputError(*faults)
+
+    code = DONE
+    for study in studies:
+        code = max(code, export_study(study, out or Path("results") / profile / "runs"))
+        if code == BAD:
+            raise typer.Exit(BAD)
+    words = ["rhmc", "report", *(["--study", str(files[0])] if len(files) == 1 else [])]
+    words += ["--profile", profile] if profile != "quick" else []
+    words += ["--variant", variant] if variant and len(files) == 1 else []
+    words += ["--runs", str(out)] if out else []
+    tell(f"next:  {shlex.join(words)}")
+    raise typer.Exit(code)

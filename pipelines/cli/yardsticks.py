@@ -1,0 +1,169 @@
+"""`rhmc yardsticks`: scores of policies that need no learning."""
+
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pipelines.cli.common import DONE, Json, Profile, folder_option, profile_faults, say_json, table, tell
+from pipelines.specs.limits import EPISODES, JOBS, SEED
+from pipelines.workspace.errors import InputError
+
+if TYPE_CHECKING:
+    from pipelines.export.yardsticks import Scored
+
+app = typer.Typer(help="Score scripted policies and bounds.", no_args_is_help=True)
+
+Fields = dict[str, Any]
+
+
+def verb(name: str) -> Callable[[Callable[..., Fields]], Callable[..., None]]:
+    """Make a verb of a function from a task's options to its fields: the options of every bank are added to them."""
+
+    def of_task(fields: Callable[..., Fields]) -> Callable[..., None]:
+        own = inspect.signature(fields).parameters
+        shared = inspect.signature(_score).parameters
+
+        def call(**given: Any) -> None:
+            task = fields(**{option: given.pop(option) for option in own})
+            _score(name, task, **given)
+
+        options = [*own.values(), *(p for option, p in shared.items() if option not in ("kind", "fields"))]
+        call.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
+        call.__annotations__ = {option.name: option.annotation for option in options}
+        call.__doc__ = fields.__doc__
+        app.command(name)(call)
+        return call
+
+    return of_task
+
+
+def _score(
+    kind: str,
+    fields: Fields,
+    episodes: Annotated[int, typer.Option(min=2, max=EPISODES, help="Episodes of the bank.")] = 1000,
+    policies: Annotated[
+        str | None, typer.Option(help="Names with commas between; all but the planner if not given.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, max=SEED, help="Names the bank of episodes.")] = 0,
+    as_json: Json = False,
+    out: Annotated[
+        Path | None, typer.Option(help="Also write yardsticks.parquet there, beside the runs' tables.")
+    ] = None,
+    profile: Annotated[str, typer.Option(help="The profile that --out is for.")] = "quick",
+) -> None:
+    import torch
+
+    from rhmc.scripted.yardsticks import yardsticks
+
+    env = _env(kind, fields)
+    chosen = None if policies is None else [name.strip() for name in policies.split(",")]
+    _check(kind, chosen or [], profile)
+    torch.set_num_threads(1)
+    with folder_option(out):
+        scores = yardsticks(env, chosen, episodes=episodes, seed=seed)
+        if out is not None:
+            from pipelines.export.yardsticks import Bank, Scored, export_yardsticks
+
+            written = export_yardsticks([Scored(Bank(env, tuple(scores), episodes, seed), scores)], profile, out)
+            tell(f"wrote {written}")
+    if as_json:
+        say_json(scores)
+        raise typer.Exit(DONE)
+    columns = list(dict.fromkeys(key for score in scores.values() for key in score))
+    rows = [[name, *(f"{score[key]:.2f}" if key in score else "" for key in columns)] for name, score in scores.items()]
+    table(["policy", *columns], rows, numbers=columns)
+
+
+def _check(kind: str, policies: list[str], profile: str) -> None:
+    from pipelines.specs.document import choices
+    from rhmc.scripted.yardsticks import names
+
+    known = names(kind)
+    faults = [f"--policies: '{n}' is not allowed; {choices(n, known)}" for n in policies if n not in known]
+    faults += profile_faults(profile)
+    if faults:
+        raise InputError(*faults)
+
+
+def _env(kind: str, fields: Fields) -> Any:
+    """The task that options describe, their faults named as options."""
+    from pipelines.specs.document import Node, Place, validate
+    from rhmc.envs import ENVS
+
+    def node(value: Any, name: str) -> Node:
+        return Node(value, Place(f"--{name}"), Place(f"--{name}"), "")
+
+    cfg, faults = validate(ENVS[kind].config, node({name: node(value, name) for name, value in fields.items()}, kind))
+    if cfg is None:
+        raise InputError(*map(str, faults))
+    return cfg
+
+
+@verb("coverage")
+def coverage(
+    preset: Annotated[str, typer.Option(help="flat, executor or coordinator.")] = "flat",
+    agents: Annotated[int, typer.Option(help="Sensors.")] = 4,
+    targets: Annotated[int, typer.Option(help="Targets.")] = 5,
+) -> Fields:
+    """Coverage: the share of targets in view, its standard error and the mean reward, in percent."""
+    return {"preset": preset, "agents": agents, "targets": targets}
+
+
+@verb("navigation")
+def navigation(
+    agents: Annotated[int, typer.Option(help="Agents, and as many landmarks.")] = 3,
+    reward: Annotated[str, typer.Option(help="paper, mpe2 or mpe1.")] = "paper",
+    order: Annotated[str, typer.Option(help="Order of integration: mpe2 or mpe1.")] = "mpe2",
+) -> Fields:
+    """Navigation: the return and its standard error, landmarks covered at the end, collisions."""
+    return {"agents": agents, "reward": reward, "order": order}
+
+
+@app.command("all")
+def everything(
+    out: Annotated[Path, typer.Option(help="Folder of the tables that the report reads; made if it is not there.")],
+    profile: Profile = "quick",
+    jobs: Annotated[int, typer.Option(min=1, max=JOBS, help="Banks at a time.")] = 2,
+) -> None:
+    """Every task, policy and bound that the report uses: yardsticks.parquet, with .runs.parquet and .made.parquet.
+
+    The profile decides the number of episodes. The files are written at the end, after minutes.
+    """
+    _check("coverage", [], profile)
+    from pipelines.export.yardsticks import banks, export_yardsticks, present, score_banks
+
+    with folder_option(out):
+        present(out)  # what cannot be brought up to date is better said before the minutes than after
+        wanted, found = banks(profile), []
+        for scored in score_banks(wanted, jobs):
+            found.append(scored)
+            policies = f"{len(scored.scores)} policies" if len(scored.scores) > 1 else next(iter(scored.scores))
+            tell(f"{len(found)} of {len(wanted)}: {_named(scored)}: {policies}")
+        written = export_yardsticks(found, profile, out)
+    _show(found)
+    tell(f"wrote {written}")
+
+
+def _show(found: list["Scored"]) -> None:
+    """All scores, task by task."""
+    from pipelines.export.yardsticks import SEM_OF, TASKS
+    from rhmc.scripted.yardsticks import names
+
+    rows = sorted(
+        (TASKS.index(one.bank.env), names(one.bank.env.kind).index(name), _named(one), name, score, one.bank.env.kind)
+        for one in found
+        for name, score in one.scores.items()
+    )
+    cells = [[task, name, f"{score[SEM_OF[kind]]:.2f}", f"{score['sem']:.2f}"] for *_, task, name, score, kind in rows]
+    table(["task", "policy", "coverage or return", "sem"], cells, numbers=["coverage or return", "sem"])
+
+
+def _named(scored: "Scored") -> str:
+    """A task in words, with what sets it apart from the others."""
+    env: Any = scored.bank.env
+    if env.kind == "coverage":
+        return f"coverage {env.preset}, {env.agents} x {env.targets}"
+    return f"navigation {env.reward}, {env.agents}"

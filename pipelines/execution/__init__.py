@@ -1,0 +1,1 @@
+"""Trainings on Ray Tune: launching, recording, clusters, adoption; no search for settings."""

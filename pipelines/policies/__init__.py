@@ -1,0 +1,1 @@
+"""Trained policies in use: evaluation, transfer, assignments, animations; nothing is trained here."""

@@ -1,0 +1,184 @@
+"""One episode of a policy as a small animation, beside policies without learning and a bound if wanted."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Generator, Tensor
+
+from pipelines.policies.animation import Panel, Scene, gif
+from pipelines.specs.document import choices
+from pipelines.tracking import policy
+from pipelines.workspace.errors import InputError
+from pipelines.workspace.leftovers import scratch
+from pipelines.workspace.work_folder import Home, StoreError, whole
+from rhmc.envs import ENVS, EnvConfig, coverage
+from rhmc.scripted import SCRIPTED
+from rhmc.scripted.coverage import windows
+from rhmc.scripted.joint import best_choice
+
+FRAMES, MILLISECONDS = 40, 110
+RUN = re.compile(r"[0-9a-f]{32}")  # how MLflow names a run
+
+FREE = "free_heading_bound"  # a bound that can be shown: sensors that take any heading at once
+Act = Callable[[Any], tuple[Tensor, Tensor | None]]  # state -> action (1, N[, A]) and assignment (1, N, M) if any
+
+
+def trained(actor: policy.Actor) -> Act:
+    """How a trained policy acts in a state."""
+    observe = ENVS[actor.env.kind].physics.observe
+
+    def act(state: Any) -> tuple[Tensor, Tensor | None]:
+        action, extra = actor.act(observe(actor.env, state))
+        return action, extra.get("assignment")
+
+    return act
+
+
+def scripted(env: EnvConfig, name: str, episode: int) -> Act:
+    """How a policy without learning acts; its own draws have a generator of their own.
+
+    Raises:
+        InputError: the task has no such policy.
+    """
+    table = SCRIPTED[env.kind]
+    if name not in table:
+        known = [*table, FREE] if env.kind == "coverage" else [*table]
+        raise InputError(f"--beside: '{name}' is not allowed; {choices(name, known)}")
+    own = Generator().manual_seed(episode)
+    return lambda state: (table[name](env, state, own), None)
+
+
+def panel(env: EnvConfig, name: str, episode: int) -> list[Scene]:
+    """The scenes of a policy without learning, or of sensors that take any heading at once.
+
+    Raises:
+        InputError: the task has neither.
+    """
+    if name == FREE and env.kind == "coverage":
+        return play(env, scripted(env, "hold", episode), episode, freely)
+    return play(env, scripted(env, name, episode), episode)
+
+
+def freely(state: coverage.State) -> coverage.State:
+    """The same state with headings under which as many targets are seen as under any."""
+    bearing, distance = coverage.relation(state)
+    seen, turn = windows(bearing, distance <= coverage.RANGE)
+    window = best_choice(seen, torch.zeros_like(turn))
+    turned = state.heading + turn.gather(-1, window.unsqueeze(-1)).squeeze(-1)
+    return state._replace(heading=coverage.wrap(turned))
+
+
+@torch.no_grad()
+def play(env: EnvConfig, act: Act, episode: int, place: Callable[[Any], Any] | None = None) -> list[Scene]:
+    """The scenes of one episode, start included. Start and target motion depend on `episode` alone.
+
+    place: what is done to every state after the step into it.
+    """
+    physics = ENVS[env.kind].physics
+    world = Generator().manual_seed(episode)
+    state = physics.initial(env, 1, world)
+    scenes, rewards, infos = [Scene(state, None, "step 0")], [], []
+    for step in range(1, physics.spec(env).episode + 1):
+        action, assignment = act(state)
+        state = physics.transition(env, state, action, world)
+        state = place(state) if place else state
+        out = physics.outcome(env, state, action, assignment)
+        rewards.append(out.reward)
+        infos.append(out.info)
+        so_far = {key: torch.stack([info[key] for info in infos]) for key in infos[0]}
+        score = physics.summary(env, torch.stack(rewards), so_far)
+        text = f"step {step}: " + ", ".join(_words(name, float(value)) for name, value in _told(score).items())
+        scenes.append(Scene(state, None if assignment is None else assignment[0], text))
+    return scenes
+
+
+def _told(score: dict[str, Tensor]) -> dict[str, Tensor]:
+    names = ("return", "coverage", "landmarks_covered", "collisions")
+    return {name: score[name] for name in names if name in score}
+
+
+def _words(name: str, value: float) -> str:
+    if name == "landmarks_covered":
+        return f"{100 * value:.0f} % covered"
+    if name == "coverage":
+        return f"coverage so far {value:.1f} %"
+    return f"{value:.0f} bumps" if name == "collisions" else f"return {value:.1f}"
+
+
+def episode_gif(saved: policy.Saved, episode: int = 0, beside: str | None = None, frames: int = FRAMES) -> bytes:
+    """An episode of a trained policy as a GIF.
+
+    Args:
+        saved: whose.
+        episode: names the start and the target motion.
+        beside: also policies without learning, or `FREE`, in the same episode: names with commas between.
+        frames: at most so many.
+
+    Raises:
+        InputError: no such policy, or a state that this code cannot load.
+    """
+    env = saved.spec.env
+    names = [name.strip() for name in beside.split(",")] if beside else []
+    others = [Panel(f"{name.replace('_', ' ')}, episode {episode}", panel(env, name, episode)) for name in names]
+    try:
+        actor = policy.Actor(saved)
+    except ValueError as error:
+        raise InputError(f"the policy cannot be used: {error}") from error
+    own = f"{saved.spec.algo.kind}, seed {saved.spec.seed}, episode {episode}"
+    return gif(env, [Panel(own, play(env, trained(actor), episode)), *others], frames, MILLISECONDS)
+
+
+def render(
+    what: str | policy.Saved,
+    out: Path,
+    home: Home,
+    episode: int = 0,
+    beside: str | None = None,
+    frames: int = FRAMES,
+) -> Path:
+    """Write the animation of a policy, of a run, by its id in MLflow, or of a checkpoint, by its path.
+
+    Raises:
+        InputError: what is given cannot be used; nothing is written.
+        StoreError: the file cannot be written.
+    """
+    if out.is_dir() or not out.parent.is_dir():
+        raise InputError(f"--out: {out} is a folder" if out.is_dir() else f"--out: {out.parent} is no folder")
+    saved = what if isinstance(what, policy.Saved) else _saved(what, home)
+    torch.set_num_threads(saved.spec.trainer.threads)  # the actions of larger layers depend on it
+    write(out, episode_gif(saved, episode, beside, frames))
+    return out
+
+
+def _saved(what: str, home: Home) -> policy.Saved:
+    path = Path(what)
+    if path.exists() or not RUN.fullmatch(what):
+        return policy.load(path)
+    with scratch() as folder:
+        return policy.load(_fetch(what, home, Path(folder)))
+
+
+def _fetch(ref: str, home: Home, folder: Path) -> Path:
+    """The files of a run in the log, in a folder."""
+    from pipelines.tracking.mlflow_tracker import fetch  # 3 s
+
+    try:
+        found = fetch(ref, [policy.FILE, policy.CONFIG], home, folder)
+    except StoreError as error:
+        raise InputError(str(error)) from error
+    if policy.FILE not in found:
+        raise InputError(f"run {ref} keeps no {policy.FILE}: it is not finished, or the file is gone")
+    return folder
+
+
+def write(path: Path, content: bytes) -> None:
+    """Write a file whole or not at all.
+
+    Raises:
+        StoreError: the folder cannot be written to, or the disk is full.
+    """
+    with whole(path) as part:
+        part.write_bytes(content)

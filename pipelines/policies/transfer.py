@@ -1,0 +1,106 @@
+"""Trained policies on tasks with other numbers of agents and targets than they were trained with, as a table."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import pyarrow as pa
+
+from pipelines.export.tables import write_parquet
+from pipelines.policies.evaluation import Bank, Policy, score
+from pipelines.workspace.errors import InputError
+from pipelines.workspace.process_pool import side_by_side
+from pipelines.workspace.work_folder import without_replay
+from rhmc.envs import coverage
+
+FILE = "transfer.parquet"
+TRANSFER = pa.schema(
+    [
+        ("study", pa.string()),  # that trained the policy
+        ("arm", pa.string()),
+        ("seed", pa.int64()),
+        ("run", pa.string()),  # spec id
+        ("task", pa.string()),  # kind and preset
+        ("agents", pa.int64()),
+        ("targets", pa.int64()),
+        ("trained_agents", pa.int64()),
+        ("trained_targets", pa.int64()),
+        ("episodes", pa.int64()),
+        ("value", pa.float64()),  # mean return
+        ("sem", pa.float64()),  # its standard error over episodes
+    ]
+)
+
+Row = tuple[object, ...]
+
+
+class Size(NamedTuple):
+    """Numbers of agents and targets to play with."""
+
+    agents: int
+    targets: int
+
+
+def sizes(policy: Policy, agents: Sequence[int], targets: Sequence[int]) -> list[Size]:
+    """What to play: the trained numbers, other numbers of agents with them, and other numbers of targets with them."""
+    env = policy.saved.spec.env
+    own = Size(env.agents, getattr(env, "targets", env.agents))
+    changed = [Size(n, own.targets) for n in agents] + [Size(own.agents, m) for m in targets]
+    return sorted({own, *changed})
+
+
+def transfer(
+    study: str,
+    policies: Iterable[Policy],
+    agents: Sequence[int],
+    targets: Sequence[int],
+    episodes: int,
+    jobs: int = 1,
+) -> Iterator[Row]:
+    """Play every policy on every size; rows of the schema `TRANSFER`. Every policy meets the same episodes of a size.
+
+    Args:
+        study: that trained them.
+        policies: to play.
+        agents: numbers of agents, see `sizes`.
+        targets: numbers of targets.
+        episodes: of each bank.
+        jobs: policies at a time, each in a process of its own; the rows do not depend on it.
+
+    Raises:
+        InputError: no such task, or a policy acts only with the numbers that it was trained with.
+        StoreError: one of the processes was killed.
+    """
+    play = partial(_play, study=study, agents=agents, targets=targets, episodes=episodes)
+    for rows in side_by_side(play, map(_light, policies), jobs):
+        yield from rows
+
+
+def _light(policy: Policy) -> Policy:
+    """A policy without the replay that a run under way has, which is too much to hand to another process."""
+    return policy._replace(saved=policy.saved._replace(algorithm=without_replay(policy.saved.algorithm)))
+
+
+def _play(policy: Policy, study: str, agents: Sequence[int], targets: Sequence[int], episodes: int) -> list[Row]:
+    """The rows of one policy."""
+    env = policy.saved.spec.env
+    if not isinstance(env, coverage.Config):
+        raise InputError(f"{policy.arm}: transfer is of coverage, where agents and targets have numbers of their own")
+    rows: list[Row] = []
+    for size in sizes(policy, agents, targets):
+        found = score(policy, Bank(episodes=episodes, agents=size.agents, targets=size.targets))
+        place = (study, policy.arm, policy.saved.spec.seed, policy.saved.spec.id, f"{env.kind} {env.preset}")
+        values = (found.values["return"], found.values["return_sem"])
+        rows.append((*place, *size, env.agents, env.targets, episodes, *values))
+    return rows
+
+
+def export_transfer(rows: Iterable[Row], out: Path) -> Path:
+    """Write `transfer.parquet` in a folder.
+
+    Raises:
+        StoreError: the folder cannot be written to.
+    """
+    write_parquet(out / FILE, TRANSFER, sorted(rows, key=lambda row: row[:7]))
+    return out / FILE

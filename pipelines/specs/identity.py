@@ -1,0 +1,79 @@
+"""A name for the code that decides a run: it changes when that run's behaviour may change, and with nothing else.
+
+The code of a run is what its method's page, its task's page and the trainer import, directly or not, as
+`pipelines.specs.syntax` reads it. A page is used by nobody but its own runs, since it registers itself.
+"""
+
+import importlib.util
+from collections.abc import Iterable, Mapping
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+
+from pipelines.specs.syntax import Code, digest
+from rhmc.algorithms import ALGORITHMS
+from rhmc.envs import ENVS
+
+PACKAGE, TRAINER = "rhmc", "rhmc.training.trainer"
+LIBRARY = "torch"  # decides results beside the code
+
+
+def code_id(method: str, task: str, plugins: Iterable[str] = ()) -> str:
+    """12 hex digits over all code that decides the runs of a method in a task.
+
+    Args:
+        method: its kind.
+        task: its kind.
+        plugins: packages that a study names; all of each counts.
+
+    Raises:
+        SyntaxError: a module does not parse.
+        ModuleNotFoundError: there is no such package.
+    """
+    return combined(modules(method, task, plugins).values())
+
+
+def modules(method: str, task: str, plugins: Iterable[str] = ()) -> Mapping[str, str]:
+    """The digest of each module in the code of a method's runs in a task, by dotted name."""
+    pages = [ALGORITHMS[method].config.__module__, ENVS[task].config.__module__]
+    code = _code(frozenset({PACKAGE, *map(_top, pages), *plugins}))
+    return code.closure([TRAINER, *pages, *(name for name in code.sources if _top(name) in set(plugins))])
+
+
+def present() -> frozenset[str]:
+    """What the code of a run can be called here: of every method in every task."""
+    return frozenset(code_id(method, task) for method in ALGORITHMS for task in ENVS)
+
+
+def fingerprint() -> str:
+    """12 hex digits over all of `rhmc`: what a pipeline's stages and the nodes of a cluster have to agree on."""
+    code = _code(frozenset({PACKAGE}))
+    return combined(code.digest(name) for name in code.sources)
+
+
+@cache
+def _code(packages: frozenset[str]) -> Code:
+    """As it was when this process first asked: an edit while a study runs concerns the next launch."""
+    return Code({name: folder_of(name) for name in packages})
+
+
+def _top(module: str) -> str:
+    return module.partition(".")[0]
+
+
+def combined(digests: Iterable[str]) -> str:
+    """One digest of many, in no order, and of the library's version without the name of its build."""
+    library = f"{LIBRARY} {version(LIBRARY).partition('+')[0]}"
+    return digest("\n".join([*sorted(set(digests)), library]))
+
+
+def folder_of(package: str) -> Path:
+    """Where a package would be imported from; of a single module, its file.
+
+    Raises:
+        ModuleNotFoundError: it is not installed.
+    """
+    spec = importlib.util.find_spec(package)
+    if spec is None or not (spec.submodule_search_locations or spec.origin):
+        raise ModuleNotFoundError(f"the package {package} is not installed")
+    return Path(next(iter(spec.submodule_search_locations or []), spec.origin or ""))

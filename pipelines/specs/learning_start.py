@@ -1,0 +1,88 @@
+"""From which step on a run learns: a budget that ends before leaves the networks as they were drawn.
+
+Off-policy methods wait for the warm-up, on-policy ones for a rollout, HiT-MAC's coordinator for the end of the
+executors' practice. Steps are environment steps, summed over the parallel copies as everywhere.
+"""
+
+from typing import Any, NamedTuple
+
+from pipelines.specs.study import Setting
+from rhmc.algorithms import hitmac, rhmc
+from rhmc.envs import ENVS
+from rhmc.learning.settings import OffPolicy, OnPolicy
+
+
+class Start(NamedTuple):
+    """When a part of a method makes its first update, and what it waits for. None: never."""
+
+    step: int | None
+    waits: str
+
+
+def starts(setting: Setting) -> list[Start]:
+    """Of every part of the method that learns."""
+    algo, copies = setting.algo, setting.trainer.num_envs
+    if isinstance(algo, hitmac.Config):
+        return _hitmac(algo, copies, _episode(setting))
+    if isinstance(algo, rhmc.Config):
+        return _rhmc(algo, copies, _episode(setting))
+    if isinstance(algo, OffPolicy):
+        return [_warm(algo, copies)]
+    assert isinstance(algo, OnPolicy)
+    return [Start(algo.rollout * copies, f"rollout {algo.rollout:,} x num_envs {copies:,}")]
+
+
+def shortfall(setting: Setting) -> str:
+    """What a budget leaves untrained, with the least one that does not, in one line; nothing if it is enough."""
+    taken = _up(setting.trainer.steps, setting.trainer.num_envs)
+    late = [one for one in starts(setting) if one.step is None or one.step > taken]
+    if not late:
+        return ""
+    why = "; ".join(one.waits for one in late)
+    never = any(one.step is None for one in late)
+    need = "no budget is enough" if never else f"must be at least {max(one.step or 0 for one in late):,}"
+    return f"{setting.trainer.steps:,} steps end before '{setting.algo.kind}' learns; {need} ({why})"
+
+
+def _episode(setting: Setting) -> int:
+    return ENVS[setting.env.kind][1].spec(setting.env).episode
+
+
+def _up(steps: int, copies: int) -> int:
+    """To whole steps of all copies."""
+    return -(-steps // copies) * copies
+
+
+def _warm(algo: Any, copies: int, updates: int = 1) -> Start:
+    step = _up(algo.warmup + updates * algo.steps_per_update, copies)
+    each = f"steps_per_update {algo.steps_per_update:,}" + (f" x {updates:,}" if updates > 1 else "")
+    return Start(step, f"warmup {algo.warmup:,} + {each}")
+
+
+def _rhmc(algo: rhmc.Config, copies: int, episode: int) -> list[Start]:
+    """Executors learn once a period has ended; the coordinator with some of their updates."""
+    ended = copies * min(algo.assignment_period, episode)
+    low, high = _warm(algo, copies), _warm(algo, copies, algo.coordinator_every)
+    period = f", and assignment_period {algo.assignment_period:,}" if ended > (low.step or 0) else ""
+    return [Start(max(one.step or 0, ended), one.waits + period) for one in dict.fromkeys((low, high))]
+
+
+def _hitmac(algo: hitmac.Config, copies: int, episode: int) -> list[Start]:
+    """Executors learn while they practise, the coordinator from what it decides afterwards."""
+    practised = _up(algo.pretrain, copies)
+    low = _warm(algo, copies)
+    if low.step is None or low.step > practised:
+        low = Start(None, f"the executors practise for pretrain {algo.pretrain:,}, and need {low.waits}")
+    waited = _decided(algo.rollout, algo.assignment_period, episode, practised // copies % episode)
+    text = f"pretrain {algo.pretrain:,} + rollout {algo.rollout:,} x assignment_period {algo.assignment_period:,}"
+    return [low, Start(practised + copies * waited, f"{text} x num_envs {copies:,}")]
+
+
+def _decided(decisions: int, period: int, episode: int, begun: int) -> int:
+    """Steps of a copy until so many periods are over, when `begun` steps of the episode are; its end cuts one short."""
+    rest = episode - begun
+    first, each = -(-rest // period), -(-episode // period)
+    if decisions <= first:
+        return min(decisions * period, rest)
+    whole, last = divmod(decisions - first - 1, each)
+    return rest + whole * episode + min((last + 1) * period, episode)

@@ -1,0 +1,43 @@
+"""The studies that this package brings along: `pipelines/studies` is a link to `studies/`, and a folder in a wheel."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from pipelines.specs.document import choices
+from pipelines.workspace.errors import InputError
+from pipelines.workspace.work_folder import whole
+
+SHIPPED = Path(__file__).parents[1] / "studies"
+
+
+def names() -> list[str]:
+    """What can be copied."""
+    return sorted(path.stem for path in SHIPPED.glob("*.yaml"))
+
+
+def copy(name: str, out: Path) -> list[Path]:
+    """Write a study and the files that it includes into a folder, and return where they are.
+
+    Raises:
+        InputError: there is no such study, or another file has the place; nothing is written.
+        StoreError: the folder cannot be written to.
+    """
+    if name not in names():
+        raise InputError(f"'{name}' is no study of this package; {choices(name, names())}")
+    wanted = {out / path.relative_to(SHIPPED): path.read_bytes() for path in _files(name)}
+    for path, text in wanted.items():
+        if path.exists() and (not path.is_file() or path.read_bytes() != text):
+            raise InputError(f"{path}: something else is there; move it away, or name another folder with --out")
+    for path, text in wanted.items():
+        if not path.exists():
+            with whole(path) as part:
+                part.write_bytes(text)
+    return list(wanted)
+
+
+def _files(name: str) -> Iterator[Path]:
+    """The study, then what it includes, which lies in folders beside it."""
+    study = SHIPPED / f"{name}.yaml"
+    yield study
+    text = study.read_text(encoding="utf-8")
+    yield from (path for path in sorted(SHIPPED.glob("*/**/*.yaml")) if path.relative_to(SHIPPED).as_posix() in text)

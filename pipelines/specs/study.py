@@ -1,0 +1,686 @@
+"""Studies: a YAML file says what is compared, and resolves to the runs that answer its question.
+
+A file has `question`, `base` (env, algo, trainer), `arms` (each changes the base), `seeds` and `steps` (a number, or
+one for each profile), and may have `grid` (lists of values for dotted keys: every arm, or the base without arms, is
+taken to every combination), `variants` (each changes every arm, whatever its kind), `profiles` (what else a profile
+changes in the base, and in single arms as `changes`; the arms and the values of the grid that it is content with) and
+`resources`. The layers of a run are base, profile, arm, the profile's change of the arm, point of the grid, variant.
+All that is wrong with a file is found before anything starts.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from functools import reduce
+from pathlib import Path
+from typing import Annotated, Any, Generic, Literal, NamedTuple, Self, TypeVar
+
+from pydantic import BaseModel, Field, SerializeAsAny, ValidationInfo, field_validator
+
+from pipelines.specs import limits
+from pipelines.specs.document import (
+    Fault,
+    Node,
+    Place,
+    Unreadable,
+    choices,
+    join,
+    merge,
+    override,
+    read,
+    show,
+    validate,
+)
+from pipelines.specs.grid import MOST, Point, nested, points, replaced
+from pipelines.specs.include import included
+from pipelines.specs.safe_names import ARM, PROFILES, alike, fault_of_study, simple, study_name, too_long
+from pipelines.workspace.errors import InputError, seen
+from rhmc.algorithms import ALGORITHMS
+from rhmc.envs import ENVS, EnvConfig
+from rhmc.training import trainer
+from rhmc.types import Frozen
+
+SECTIONS = ("env", "algo", "trainer")
+COUNTS = ("seeds", "steps")  # fields of a study that hold a number for each profile
+TABLES: dict[str, dict[str, type[Any]]] = {  # the configuration of every kind
+    "env": {kind: task.config for kind, task in ENVS.items()},
+    "algo": {kind: method.config for kind, method in ALGORITHMS.items()},
+}
+NAMED = 3  # arms that a fault names
+VARIANTS = 100  # of a study
+TWIN = "is the same as arm"
+M = TypeVar("M", bound=BaseModel)
+FIELDS = [  # every dotted name of a run's settings
+    f"{section}.{field}"
+    for section, configs in (TABLES | {"trainer": {"": trainer.Config}}).items()
+    for field in sorted({name for config in configs.values() for name in config.model_fields})
+]
+COMMON = {"env": "observation", "algo": "encoder"}  # what must not differ between methods by oversight
+
+
+class StudyError(InputError):
+    """Every fault of a study, one a line."""
+
+    def __init__(self, faults: Sequence[Fault]) -> None:
+        self.faults = sorted(set(faults), key=lambda f: (f.place.source.startswith("--set"), *f))
+        super().__init__(*map(str, self.faults))
+
+
+class Setting(Frozen):
+    """A run but for its seed."""
+
+    env: SerializeAsAny[EnvConfig]
+    algo: Any
+    trainer: trainer.Config
+
+    @field_validator("env", "algo", mode="before")
+    @classmethod
+    def _of_kind(cls, value: Any, field: ValidationInfo) -> Any:
+        """A plain mapping becomes the configuration that its kind names."""
+        if not isinstance(value, dict):
+            return value
+        table, kind = TABLES[str(field.field_name)], value.get("kind")
+        if not isinstance(kind, str) or kind not in table:
+            raise ValueError(f"kind: {show(kind)} is not allowed; {choices(kind, table)}")
+        return table[kind].model_validate(value)
+
+    def canonical(self) -> str:
+        """JSON with every default written out and keys sorted: equal exactly for equal settings."""
+        return _json(self.model_dump(mode="json"))
+
+    def stated(self) -> str:
+        """As `canonical`, with the kinds and what differs from the defaults alone.
+
+        A field that is new, with a default under which nothing changes, leaves it as it was; what a default does is in
+        the code.
+        """
+        sections = {name: getattr(self, name) for name in SECTIONS}
+        kinds = {"env": {"kind": self.env.kind}, "algo": {"kind": self.algo.kind}, "trainer": {}}
+        return _json({k: kinds[k] | v.model_dump(mode="json", exclude_defaults=True) for k, v in sections.items()})
+
+
+class RunSpec(Setting):
+    """All that decides a run's result, the code and its libraries aside."""
+
+    seed: int = Field(ge=0, lt=1_000_000)  # the evaluation banks' generators are seeded from 10 million on
+
+    @property
+    def id(self) -> str:
+        """12 hex digits that name the settings and the seed."""
+        return hashlib.sha256(f"{self.stated()} {self.seed}".encode()).hexdigest()[:12]
+
+
+def _json(tree: Any) -> str:
+    return json.dumps(tree, sort_keys=True, separators=(",", ":"))
+
+
+class PlannedRun(NamedTuple):
+    """A run in its study."""
+
+    study: str
+    arm: str
+    spec: RunSpec
+
+
+class Resources(Frozen):
+    """How a study is run; changes no result."""
+
+    concurrent: int = Field(2, ge=1, description="runs at a time")
+    cpus: int = Field(1, ge=1, description="processors of a run")
+    checkpoint_every: int = Field(20, ge=1, description="points of the evaluation grid between checkpoints")
+    animate: Literal["first", "all", "none"] = Field("first", description="seeds whose runs keep an animated episode")
+
+
+class Study(Frozen):
+    """A study resolved for one profile and variant: every arm is a complete setting."""
+
+    name: str  # the file's stem; of a variant `stem@variant`, so that its runs and results have a place of their own
+    profile: str
+    question: str
+    base: Setting
+    arms: dict[str, Setting]
+    seeds: int
+    steps: int
+    resources: Resources
+    file: str = ""  # as given, for commands that a person can repeat
+    overrides: tuple[str, ...] = ()
+    variant: str = ""
+    remarks: tuple[str, ...] = ()  # what is allowed and gives nothing: arms whose budget ends before they learn
+
+    @classmethod
+    def load(
+        cls, path: Path | str, profile: str = "quick", overrides: Sequence[str] = (), variant: str | None = None
+    ) -> Self:
+        """Read, merge and check a study.
+
+        Args:
+            path: the file; its stem is the study's name.
+            profile: one of `PROFILES`.
+            overrides: `key=value`, key a dotted path of the file (`seeds`, `base.algo.lr`, `arms.full.env.agents`),
+                merged into it as an arm is into the base. `env.`, `algo.` and `trainer.` stand for `base.env.` and so
+                on, and `trainer.steps` for `steps`. They go before a profile's changes of the base;
+                an arm keeps what it states, or the profile for it.
+            variant: one of the file's `variants`; None for the arms as they stand.
+
+        Raises:
+            StudyError: with every fault found.
+        """
+        loaded = load_layers(Path(path), File, profile, overrides, COUNTS, gridded=GridFile, variant=variant)
+        file, wanted = loaded.file, loaded.wanted
+        if loaded.faults or file is None or wanted.base is None:
+            raise StudyError(_no_study(loaded.root) or loaded.faults)
+        resolved = {name: getattr(getattr(file, name), profile) for name in COUNTS}
+        fixed = {"question": file.question.strip(), "resources": file.resources, "profile": profile}
+        fixed |= {"file": str(path), "overrides": tuple(overrides), "variant": variant or ""}
+        name = study_name(Path(path), variant or "")
+        fixed["remarks"] = tuple(map(str, dict.fromkeys(wanted.remarks)))
+        return cls(name=name, base=wanted.base, arms=wanted.arms, **fixed, **resolved)
+
+    def runs(self) -> list[PlannedRun]:
+        """Every run: arms in the file's order, seeds 0, 1, ..."""
+        return [
+            PlannedRun(self.name, arm, RunSpec(**dict(setting), seed=seed))
+            for arm, setting in self.arms.items()
+            for seed in range(self.seeds)
+        ]
+
+
+def changes(base: Setting, setting: Setting) -> dict[str, Any]:
+    """What differs from the base, by dotted path; of another kind, the kind alone."""
+    differs: dict[str, Any] = {}
+    for section in SECTIONS:
+        before, after = getattr(base, section), getattr(setting, section)
+        if type(before) is not type(after):
+            differs[f"{section}.kind"] = after.kind
+            continue
+        names = [name for name in type(after).model_fields if getattr(before, name) != getattr(after, name)]
+        differs |= {f"{section}.{name}": getattr(after, name) for name in names}
+    return differs
+
+
+# The file's shape. What stands inside env, algo and trainer is checked once the layers are merged.
+
+
+class Layer(Frozen):
+    """What the base, a profile or an arm states."""
+
+    env: dict[str, Any] = Field(default_factory=dict)
+    algo: dict[str, Any] = Field(default_factory=dict)
+    trainer: dict[str, Any] = Field(default_factory=dict)
+
+
+class Base(Layer):
+    """What every run starts from."""
+
+    env: dict[str, Any]
+    algo: dict[str, Any]
+
+
+class Counts(Frozen):
+    """A number for each profile."""
+
+    quick: int | None = Field(None, ge=1, le=10**12)
+    paper: int | None = Field(None, ge=1, le=10**12)
+
+
+class SeedCounts(Frozen):
+    """A number of seeds for each profile."""
+
+    quick: int | None = Field(None, ge=1, le=1000)
+    paper: int | None = Field(None, ge=1, le=1000)
+
+
+Grid = dict[str, Annotated[list[Any], Field(min_length=1)]]  # by dotted name of a setting
+
+
+class Profile(Layer):
+    """What a profile changes in the base and in single arms, which it is content with, and which values of the grid."""
+
+    arms: list[str] | None = Field(None, min_length=1)
+    changes: dict[str, Layer] = Field(default_factory=dict)
+    grid: Grid = Field(default_factory=dict)
+
+
+class Profiles(Frozen):
+    """What each profile changes."""
+
+    quick: Profile = Profile()
+    paper: Profile = Profile()
+
+
+class File(Frozen):
+    """A study's file."""
+
+    question: str = Field(min_length=1)
+    base: Base
+    arms: dict[str, Layer] = Field(min_length=1)
+    grid: Grid = Field(default_factory=dict)
+    variants: dict[str, Layer] = Field(default_factory=dict)
+    seeds: SeedCounts
+    steps: Counts
+    profiles: Profiles = Profiles()
+    resources: Resources = Resources()
+
+
+class GridFile(File):
+    """A study's file with a grid, which need not have arms."""
+
+    arms: dict[str, Layer] = Field(default_factory=dict)
+    grid: Grid = Field(min_length=1)
+
+
+# Reading
+
+
+class Resolved(NamedTuple):
+    """The layers of a file merged for one profile and variant."""
+
+    base: Setting | None
+    arms: dict[str, Setting]
+    faults: list[Fault]
+    remarks: Sequence[Fault] = ()
+
+
+class Loaded(NamedTuple, Generic[M]):
+    """A file whose layers are merged, and every fault so far; `file` is None where its shape is wrong."""
+
+    file: M | None
+    root: Node
+    wanted: Resolved
+    faults: list[Fault]
+
+
+def load_layers(
+    path: Path,
+    model: type[M],
+    profile: str,
+    overrides: Sequence[str],
+    counts: Sequence[str],
+    *,
+    gridded: type[M] | None = None,
+    variant: str | None = None,
+) -> Loaded[M]:
+    """Read, merge and check what all files with arms have in common.
+
+    Args:
+        path: the file.
+        model: its shape; what that does not know changes no arm.
+        profile: one of `PROFILES`.
+        overrides: see `Study.load`.
+        counts: names of the fields that hold a number for each profile.
+        gridded: its shape where it has a grid.
+        variant: one of its `variants`; None for the arms as they stand.
+
+    Raises:
+        StudyError: there is no mapping to go on with.
+    """
+    root, patches, faults = _trees(path, model, profile, overrides)
+    root = _normal(reduce(merge, patches, root), counts)
+    file, structure = validate(gridded if gridded and "grid" in root.children else model, root)
+    known = root._replace(value={key: child for key, child in root.children.items() if key in model.model_fields})
+    variants = _group(known, "variants")
+    settings = {(p, v): _settings(known, p, v, patches) for p in PROFILES for v in (None, *variants)}
+    faults += structure + _variant_faults(path, variants, variant)
+    # An arm that is wrong in its shape resolves to the base: that it is the same as another is no news then.
+    faults += [f for one in settings.values() for f in one.faults if not (structure and TWIN in f.text)]
+    if file is not None and profile in PROFILES:
+        faults += [f for name in counts for f in _no_value(root, name, profile)]
+    return Loaded(file, root, settings.get((profile, variant)) or settings[PROFILES[0], None], faults)
+
+
+def _trees(
+    path: Path, model: type[BaseModel], profile: str, overrides: Sequence[str]
+) -> tuple[Node, list[Node], list[Fault]]:
+    """The file and each override as a tree, what they include in its place, and the faults of the options.
+
+    Raises:
+        StudyError: there is no mapping to go on with.
+    """
+    faults = [] if profile in PROFILES else [_no_profile(profile)]
+    root, found = read(path)
+    faults += found
+    if root is None or not isinstance(root.value, dict):
+        raise StudyError(faults or [_no_mapping(path, root, model)])
+    if fault := fault_of_study(study_name(path)):
+        faults.append(Fault(Place(str(path)), "", fault))
+    if crowded := _crowded(root):
+        raise StudyError([*faults, *crowded])
+    patches, found = _patches(root, overrides)
+    whole = [included(tree, path.parent, SECTIONS) for tree in (root, *patches)]
+    faults += found + [fault for _, more in whole for fault in more]
+    return whole[0][0], [tree for tree, _ in whole[1:]], faults
+
+
+# Overrides
+
+
+def _patches(root: Node, overrides: Iterable[str]) -> tuple[list[Node], list[Fault]]:
+    """Each override as a tree to be merged into the file's."""
+    patches: list[Node] = []
+    faults: list[Fault] = []
+    for text in overrides:
+        key, equals, value = text.partition("=")
+        parts = _target(root, key.strip())
+        source = f"--set {text}"
+        arms = list(root.children.get("arms", root).children)
+        if parts[0] == "arms" and len(parts) > 2 and parts[1] not in arms:  # a whole arm may be added
+            faults.append(Fault(Place(source), "arms", f"no arm '{parts[1]}'; {choices(parts[1], arms)}"))
+            continue
+        if not equals or not all(parts):
+            faults.append(Fault(Place(source), "", "must be key=value, as in --set seeds=1 or --set algo.lr=1e-3"))
+            continue
+        node, found = override(source, ".".join(parts), value)
+        faults += found
+        if node is not None:
+            patches.append(nested(parts, node))
+        elif not found:
+            faults.append(Fault(Place(source), ".".join(parts), "no value"))
+    return patches, faults
+
+
+def _target(root: Node, key: str) -> list[str]:
+    """Keys from the root to what an override names; names with dots in them are matched against what is there."""
+    parts = key.split(".")
+    parts = ["base", *parts] if parts[0] in SECTIONS else parts
+    if parts == ["base", "trainer", "steps"]:
+        return ["steps"]
+    for i, part in enumerate(parts[:-1]):
+        of_profile = i == 2 and parts[0] == "profiles"
+        if part == "grid" and (i == 0 or of_profile):  # its keys are dotted themselves
+            return [*parts[: i + 1], ".".join(parts[i + 1 :])]
+    start = 1 if parts[0] == "arms" else 3 if parts[0] == "profiles" and parts[2:3] == ["changes"] else 0
+    for name in list(root.children.get("arms", root).children) if start else []:
+        words = name.split(".")
+        if parts[start : start + len(words)] == words:
+            return [*parts[:start], name, *parts[start + len(words) :]]
+    return parts
+
+
+# Layers to settings
+
+
+def _normal(root: Node, counts: Sequence[str]) -> Node:
+    """One form for what may be written shortly: a number for all profiles, an arm with nothing in it."""
+    children = dict(root.children)
+    for name in counts:
+        node = children.get(name)
+        if node is not None and not isinstance(node.value, dict):
+            children[name] = node._replace(value=dict.fromkeys(PROFILES, node))
+    for name in ("arms", "profiles", "variants"):
+        if name in children and children[name].children:
+            filled = {k: v._replace(value={}) if v.value is None else v for k, v in children[name].children.items()}
+            children[name] = children[name]._replace(value=filled)
+    return root._replace(value=children)
+
+
+def _settings(root: Node, profile: str, variant: str | None, patches: Sequence[Node]) -> Resolved:
+    """Resolve the base and every arm for a profile. Overrides of the base go before what the profile changes in it."""
+    chosen = _child(_child(root, "profiles"), profile)
+    layers = [root.children.get("base"), chosen, *(_child(patch, "base") for patch in patches)]
+    stated = [layer for layer in layers if layer is not None and isinstance(layer.value, dict)]
+    common = [reduce(merge, stated)] if stated else []
+    last = [layer for layer in [_child(_child(root, "variants"), variant or "")] if layer]
+    steps = _child(_child(root, "steps"), profile)
+    base, faults = _setting([*common, *last] if common else [], steps)
+    planned, found = _planned(root, chosen, patches)
+    faults += found + [fault for layer in last for fault in _unstated(common[0] if common else None, layer)]
+    arms: dict[str, Setting] = {}
+    first: dict[str, str] = {}  # arm by its setting
+    owners: dict[Fault, list[str]] = {}
+    for name, (written, arm) in planned.items():
+        faults += _unstated(common[0] if common else None, arm)
+        setting, found = _setting([*common, arm, *last], steps)
+        for fault in set(found) - set(faults):
+            owners.setdefault(fault, []).append(written)
+        if setting is not None:
+            same = first.setdefault(setting.canonical(), name)
+            faults += _twin(same, arm, name, variant) if same != name else []
+            arms[name] = setting
+    plain = ("arms.", f"profiles.{profile}.changes.", *(() if _group(root, "arms") else ("grid.",)))
+    faults += [f if f.path.startswith(plain) else _owned(f, names) for f, names in owners.items()]
+    kept, found = _kept(root, chosen)
+    arms = {name: arm for name, arm in arms.items() if kept is None or planned[name][0] in kept}
+    return Resolved(base, arms, faults + found, _unlearned(arms, steps) if steps else [])
+
+
+def _unlearned(arms: Mapping[str, Setting], steps: Node) -> list[Fault]:
+    """Arms whose budget ends before they learn, at its place."""
+    from pipelines.specs.learning_start import shortfall  # which knows settings
+
+    owners: dict[str, list[str]] = {}
+    for name, setting in arms.items():
+        owners.setdefault(shortfall(setting), []).append(name)
+    return [_owned(Fault(steps.place, steps.path, text), names) for text, names in owners.items() if text]
+
+
+def _planned(
+    root: Node, profile: Node | None, patches: Sequence[Node]
+) -> tuple[dict[str, tuple[str, Node]], list[Fault]]:
+    """Every arm of a profile at every point of its grid, by name: the arm as written, and all that it states."""
+    arms, faults = _changed(_group(root, "arms"), profile, patches)
+    grid, found = replaced(_child(root, "grid"), _child(profile, "grid"))
+    combined, more = points(grid, FIELDS, len(arms))
+    crossed = _crossed(arms, combined)
+    more += _alike_faults("arm", {name: arm for name, (_, arm) in crossed.items()})
+    more += [_long_name(name, arm) for name, (_, arm) in crossed.items() if len(name) > ARM]
+    return crossed, faults + found + more
+
+
+def _changed(
+    arms: dict[str, Node], profile: Node | None, patches: Sequence[Node]
+) -> tuple[dict[str, Node], list[Fault]]:
+    """The arms with what a profile changes in them. Overrides, which the arms hold already, go before that."""
+    faults = [fault for name, arm in arms.items() for fault in _name_faults(name, arm)]
+    changes = _group(profile, "changes") if profile else {}
+    unknown = {name: node for name, node in changes.items() if name not in arms}
+    allowed = {name: choices(name, arms) if arms else "this study has none, but a grid" for name in unknown}
+    faults += [Fault(n.key, n.path, f"{show(name)} is no arm; {allowed[name]}") for name, n in unknown.items()]
+    layers = [changes, *(_group(patch, "arms") for patch in patches)] if changes else []
+    changed = {name: [layer[name] for layer in layers if name in layer] for name in arms if name in changes}
+    return {name: reduce(merge, changed.get(name, []), arm) for name, arm in arms.items()}, faults
+
+
+def _crossed(arms: Mapping[str, Node], combined: Sequence[Point]) -> dict[str, tuple[str, Node]]:
+    if not arms or not combined:
+        return {name: (name, arm) for name, arm in [*arms.items(), *combined]}
+    return {f"{name}, {p.name}": (name, merge(arm, p.layer)) for name, arm in arms.items() for p in combined}
+
+
+def _kept(root: Node, profile: Node | None) -> tuple[set[str] | None, list[Fault]]:
+    """The arms, as written, that a profile is content with; None for all."""
+    wanted, arms = _child(profile, "arms"), _group(root, "arms")
+    if wanted is None or not isinstance(wanted.value, list):
+        return None, []
+    names = [one for one in wanted.value if isinstance(one.value, str)]
+    faults = [Fault(n.place, n.path, f"{show(n.value)} is no arm; {choices(n.value, arms)}") for n in names]
+    return {str(n.value) for n in names}, [f for n, f in zip(names, faults, strict=True) if n.value not in arms]
+
+
+def _group(root: Node, key: str) -> dict[str, Node]:
+    """The arms, or the variants, as written."""
+    group = _child(root, key)
+    return group.children if group else {}
+
+
+def _setting(layers: Sequence[Node], steps: Node | None) -> tuple[Setting | None, list[Fault]]:
+    parts, faults = {}, []
+    for section in SECTIONS:
+        node = _section(layers, section)
+        if node is not None:
+            parts[section], found = _trainer(node, steps) if section == "trainer" else _of_kind(section, node)
+            faults += found
+    complete = len(parts) == len(SECTIONS) and all(part is not None for part in parts.values())
+    if not complete or faults:
+        return None, faults
+    setting = Setting(**parts)
+    faults = _misfit(setting, layers)
+    return (None if faults else setting), faults
+
+
+def _misfit(setting: Setting, layers: Sequence[Node]) -> list[Fault]:
+    """A method that cannot act in its task, at the place of the task's field that it cannot do with."""
+    text = trainer.misfit(setting.env, setting.algo) or limits.misfit(setting.env, setting.algo)
+    if not text:
+        return []
+    field, _, fault = text.partition(": ")
+    env = _section(layers, "env")
+    node = _child(env, field) or env
+    return [Fault(node.place, node.path, fault)] if node else []
+
+
+def _section(layers: Sequence[Node], name: str) -> Node | None:
+    """One section of all layers merged; None where the file's shape is wrong, which is said elsewhere."""
+    stated = [layer.children[name] for layer in layers if name in layer.children]
+    if not stated and name == "trainer" and layers:
+        return layers[0]._replace(value={})
+    if not stated or not all(isinstance(node.value, dict) for node in stated):
+        return None
+    return reduce(merge, stated)
+
+
+def _of_kind(section: str, node: Node) -> tuple[BaseModel | None, list[Fault]]:
+    table, kind = TABLES[section], node.children.get("kind")
+    if kind is None and node.path.startswith("base."):
+        return None, [Fault(node.key, join(node.path, "kind"), f"missing; allowed: {', '.join(table)}")]
+    if kind is None or isinstance(kind.value, Unreadable):
+        return None, []  # said of the base, or of the value
+    if not isinstance(kind.value, str) or kind.value not in table:
+        return None, [Fault(kind.place, kind.path, f"{show(kind.value)} is not allowed; {choices(kind.value, table)}")]
+    return validate(table[kind.value], node)
+
+
+def _trainer(node: Node, steps: Node | None) -> tuple[BaseModel | None, list[Fault]]:
+    children, faults = dict(node.children), []
+    if "steps" in children:
+        written = children.pop("steps")
+        text = "a study's budget is the same for every run; write it as 'steps' at the top of the file"
+        faults.append(Fault(written.key, written.path, text))
+    if steps and isinstance(steps.value, int) and 1 <= steps.value <= limits.BOUNDS["steps"]:
+        children["steps"] = steps
+    config, found = validate(trainer.Config, node._replace(value=children), hidden=("steps",))
+    return config, faults + found
+
+
+def _child(node: Node | None, key: str) -> Node | None:
+    return node.children.get(key) if node else None
+
+
+# Faults that no model finds
+
+
+def _no_profile(profile: str) -> Fault:
+    return Fault(Place("--profile"), "", f"{show(profile)} is not allowed; {choices(profile, PROFILES)}")
+
+
+def _crowded(root: Node) -> list[Fault]:
+    """More arms or variants than a study can be resolved with in reasonable time."""
+    most = {"arms": MOST, "variants": VARIANTS}
+    found = {key: len(node.children) for key, node in root.children.items() if key in most}
+    where = root.children
+    return [
+        Fault(where[key].key, key, f"{count:,} of them; at most {most[key]:,}")
+        for key, count in found.items()
+        if count > most[key]
+    ]
+
+
+def study_fault(name: str) -> str:
+    """What is wrong with the name of a study (of a variant: `stem@variant`), or nothing; it becomes part of paths."""
+    stem, at, variant = name.partition("@")
+    fault = fault_of_study(stem) or too_long(name)
+    return fault or ("a variant is named with letters, digits, '-' and '_' only" if at and not simple(variant) else "")
+
+
+def arm_fault(name: str) -> str:
+    """What is wrong with the name of an arm, or nothing."""
+    if not all(map(seen, name)):
+        return f"{show(name)} is no name for an arm; it has characters that cannot be seen"
+    arm = Node(None, Place(""), Place(""), "")
+    found = _name_faults(name, arm) or ([_long_name(name, arm)] if len(name) > ARM else [])
+    return found[0].text if found else ""
+
+
+def _variant_faults(path: Path, variants: Mapping[str, Node], wanted: str | None) -> list[Fault]:
+    text = "a variant is named with letters, digits, '-' and '_' only"
+    faults = [Fault(node.key, node.path, text) for name, node in variants.items() if not simple(name)]
+    longest = {name: too_long(study_name(path, name)) for name in variants}
+    faults += [
+        Fault(variants[name].key, variants[name].path, f"with the study's, {fault}")
+        for name, fault in longest.items()
+        if fault
+    ]
+    faults += _alike_faults("variant", variants)
+    if wanted is not None and wanted not in variants:
+        allowed = choices(wanted, variants) if variants else "this study has no variants"
+        faults.append(Fault(Place("--variant"), "", f"{show(wanted)} is not allowed; {allowed}"))
+    return faults
+
+
+def _no_mapping(path: Path, root: Node | None, model: type[BaseModel]) -> Fault:
+    if root is None or root.value is None:
+        return Fault(Place(str(path), 1, 1), "", f"empty; a study has {', '.join(model.model_fields)}")
+    text = f"{show(root.value)} is not a study; must be a mapping with {', '.join(model.model_fields)}"
+    return Fault(root.place, "", text)
+
+
+def _no_study(root: Node) -> list[Fault]:
+    """Say this alone where a search was given."""
+    if not any("space" in arm.children for arm in _group(root, "arms").values()):
+        return []
+    return [Fault(Place(root.place.source, 1, 1), "", "an arm has a space: a search, for `rhmc search`, is no study")]
+
+
+def _no_value(root: Node, name: str, profile: str) -> list[Fault]:
+    """A study may leave out a profile, until it is asked for."""
+    node = root.children[name]
+    given = [key for key, child in node.children.items() if child.value is not None]
+    if profile in given:
+        return []
+    return [Fault(node.key, join(node.path, profile), f"missing; there is a value for: {', '.join(given) or 'none'}")]
+
+
+def _name_faults(name: str, arm: Node) -> list[Fault]:
+    if name and name == name.strip() and "/" not in name:  # that it can be seen is said of every key
+        return []
+    return [Fault(arm.key, arm.path, f"{show(name)} is no name for an arm; use a few words, without '/'")]
+
+
+def _alike_faults(what: str, named: Mapping[str, Node]) -> list[Fault]:
+    """Names that people, file systems and databases take for one."""
+    text = "in case, blanks or the form of a letter alone; give it another name"
+    return [
+        Fault(named[name].key, named[name].path, f"{show(name)} differs from {what} {show(other)} {text}")
+        for name, other in alike(named)
+    ]
+
+
+def _long_name(name: str, arm: Node) -> Fault:
+    text = f"{show(name)} is no name for an arm; it has {len(name):,} characters, at most {ARM}"
+    return Fault(arm.key, arm.path, text)
+
+
+def _unstated(base: Node | None, arm: Node) -> list[Fault]:
+    """An arm of another kind inherits nothing, so what must be alike for all methods has to be said again."""
+    faults = []
+    for section, field in COMMON.items():
+        before, after = _child(base, section), _child(arm, section)
+        common, kind, other = _child(before, field), _child(before, "kind"), _child(after, "kind")
+        if not (common and kind and after and other) or kind.value == other.value or field in after.children:
+            continue
+        config = TABLES[section].get(str(other.value))
+        if config and field in config.model_fields:
+            text = f"missing; another kind inherits nothing, and the base has {show(common.value)}: state it here"
+            faults.append(Fault(after.place, join(after.path, field), text))
+    return faults
+
+
+def _twin(other: str, arm: Node, name: str, variant: str | None) -> list[Fault]:
+    where = f" in variant {show(variant)}" if variant else ""
+    return [Fault(arm.key, arm.path, f"arm {show(name)} {TWIN} {show(other)}{where}")]
+
+
+def _owned(fault: Fault, arms: Sequence[str]) -> Fault:
+    """Name the arms in which a fault shows, as its place does not."""
+    names = list(dict.fromkeys(arms))
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return fault._replace(text=f"{fault.text} (in arm {', '.join(show(name) for name in names[:NAMED])}{more})")

@@ -1,0 +1,298 @@
+"""Where runs are logged: the protocol, and a twin in memory that obeys it.
+
+A run in a log is named by study, profile, arm and key (spec id and code fingerprint). Starting one that is there
+already continues it, unless it came from elsewhere (`Card.imported`): values of two machines do not meet in one run. A
+point that is logged already is not logged again.
+"""
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Literal, NamedTuple, Protocol
+
+from pipelines.workspace.provenance import Host
+from rhmc.types import Metrics
+
+VALUES_ONLY = "values_only"  # tag of a run that came from a bundle without its policy
+Status = Literal["running", "finished", "failed", "interrupted"]
+ADOPTED = "adopted"  # tag of a run that other code made: which, and what was compared
+
+
+class StudyCard(NamedTuple):
+    """A study as its log shows it."""
+
+    study: str
+    profile: str
+    note: str  # Markdown: question, arms, seeds, budget
+    params: Mapping[str, Sequence[str]] = MappingProxyType({})  # what varies, by method (arm of a search)
+    arms: Sequence[str] = ()
+
+
+class Card(NamedTuple):
+    """A run as its log shows it."""
+
+    arm: str
+    seed: int
+    spec_id: str
+    fingerprint: str
+    algorithm: str
+    task: str
+    commit: str
+    params: dict[str, str]  # what varies between the runs of the study, and method and seed
+    trial: int | None = None  # of a search: then the run stands for all of its seeds
+    host: Host = Host()  # that starts it
+    modules: Mapping[str, str] = MappingProxyType({})  # digests of the code that decides it
+    imported: str = ""  # names what a bundle has of it, should it come from one
+
+    @property
+    def key(self) -> str:
+        """What was trained: spec id and fingerprint."""
+        return f"{self.spec_id}-{self.fingerprint}"
+
+    @property
+    def name(self) -> str:
+        """What a person calls it."""
+        return f"{self.arm} s{self.seed}" if self.trial is None else f"{self.arm} t{self.trial}"
+
+
+class Recorded(NamedTuple):
+    """A run found in a log."""
+
+    ref: str  # the log's own name of it
+    arm: str
+    key: str
+    status: Status
+    commit: str
+    stale: bool = False  # marked as no part of the latest plan
+    host: Host = Host()
+    error: str = ""  # why it failed, one line
+    values_only: bool = False  # taken in from a bundle without policies
+    modules: Mapping[str, str] = MappingProxyType({})  # of the code that made it, where that was kept
+    adopted: str = ""  # from which code, and what was compared, if another code made it
+
+
+class Row(NamedTuple):
+    """One value of one metric."""
+
+    ref: str
+    step: int
+    metric: str
+    value: float
+
+
+class RunLog(Protocol):
+    """One run that is being logged."""
+
+    @property
+    def ref(self) -> str: ...
+
+    def log(self, points: Sequence[Metrics]) -> None:
+        """Add points (each with a key `step`); values of a metric and step that are there already are left alone."""
+        ...
+
+    def artifact(self, path: Path) -> None:
+        """Keep a copy of a file under its name."""
+        ...
+
+    def text(self, name: str, content: str) -> None:
+        """Keep a text under a file name."""
+        ...
+
+    def tag(self, name: str, value: str) -> None:
+        """Set or replace a tag."""
+        ...
+
+    def model(self, policy: Path) -> None:
+        """Offer the policy in a file as a model that can be loaded by name; once, however often it is called."""
+        ...
+
+    def finish(self, status: Status) -> None:
+        """Close the run. It can be started again."""
+        ...
+
+
+class Tracker(Protocol):
+    """The log of one study and profile."""
+
+    def recorded(self) -> list[Recorded]:
+        """The runs logged so far, oldest first."""
+        ...
+
+    def finished_anywhere(self, keys: Collection[str]) -> dict[str, str]:
+        """Key -> ref of a finished run with one of these keys, of whatever study shares the log."""
+        ...
+
+    def mark(self, ref: str, *, stale: bool) -> None:
+        """Say of a run whether the latest plan is without it: then it stays, and views and averages pass over it."""
+        ...
+
+    def start(self, card: Card) -> RunLog:
+        """Begin a run, or continue it; one of another origin is dropped, and begun anew."""
+        ...
+
+    def drop(self, ref: str) -> None:
+        """Take a run that is not finished out of the log."""
+        ...
+
+    def rows(self, refs: Sequence[str], metrics: Collection[str] | None = None) -> list[Row]:
+        """All values of the runs, or those of some metrics; each metric and step once, sorted."""
+        ...
+
+    def file(self, ref: str, name: str, folder: Path) -> Path | None:
+        """Write a file that a run keeps to a folder; None if it keeps none of that name."""
+        ...
+
+    def files_of(self, ref: str) -> str:
+        """Where the files of a run are looked for, for a person."""
+        ...
+
+    def publish(self, note: str, files: Mapping[str, bytes]) -> None:
+        """Replace the study's description (Markdown) and its files of these names."""
+        ...
+
+    def close(self, status: Status) -> None:
+        """End the present launch. Runs left running become `interrupted`."""
+        ...
+
+
+def unseen(points: Iterable[Metrics], seen: set[tuple[str, int]]) -> list[tuple[str, int, float]]:
+    """(metric, step, value) of each value that is not in `seen`, which is brought up to date."""
+    new = []
+    for point in points:
+        step = int(point["step"])
+        for metric, value in point.items():
+            if metric != "step" and (metric, step) not in seen:
+                seen.add((metric, step))
+                new.append((metric, step, value))
+    return new
+
+
+def points_of(rows: Iterable[Row]) -> list[Metrics]:
+    """The rows of one run as the points they came from."""
+    points: dict[int, Metrics] = {}
+    for row in rows:
+        points.setdefault(row.step, {"step": float(row.step)})[row.metric] = row.value
+    return [points[step] for step in sorted(points)]
+
+
+@dataclass
+class MemoryRun:
+    """A run of the twin."""
+
+    ref: str
+    study: StudyCard
+    card: Card
+    status: Status = "running"
+    values: list[Row] = field(default_factory=list)
+    seen: set[tuple[str, int]] = field(default_factory=set)
+    tags: dict[str, str] = field(default_factory=dict)
+    files: dict[str, bytes] = field(default_factory=dict)
+    models: list[bytes] = field(default_factory=list)
+
+    def log(self, points: Sequence[Metrics]) -> None:
+        """See `RunLog`."""
+        self.values += [Row(self.ref, step, metric, value) for metric, step, value in unseen(points, self.seen)]
+
+    def artifact(self, path: Path) -> None:
+        """See `RunLog`."""
+        self.files[path.name] = path.read_bytes()
+
+    def text(self, name: str, content: str) -> None:
+        """See `RunLog`."""
+        self.files[name] = content.encode()
+
+    def tag(self, name: str, value: str) -> None:
+        """See `RunLog`."""
+        self.tags[name] = value
+
+    def model(self, policy: Path) -> None:
+        """See `RunLog`."""
+        self.models = self.models or [policy.read_bytes()]
+
+    def finish(self, status: Status) -> None:
+        """See `RunLog`."""
+        self.status = status
+
+
+class MemoryTracker:
+    """The twin: what several of them share is `shelf`, as trackers of MLflow share a database."""
+
+    def __init__(self, study: StudyCard, shelf: list[MemoryRun]) -> None:
+        self.study, self.shelf = study, shelf
+        self.note, self.files = study.note, dict[str, bytes]()
+        self._interrupt_running()
+
+    def _mine(self) -> list[MemoryRun]:
+        return [run for run in self.shelf if run.study[:2] == self.study[:2]]
+
+    def _interrupt_running(self) -> None:
+        for run in self._mine():
+            if run.status == "running":
+                run.finish("interrupted")
+
+    def recorded(self) -> list[Recorded]:
+        """See `Tracker`."""
+        return [
+            Recorded(
+                *(r.ref, r.card.arm, r.card.key, r.status, r.card.commit, "stale" in r.tags, r.card.host),
+                *(r.tags.get("error", ""), VALUES_ONLY in r.tags, r.card.modules, r.tags.get(ADOPTED, "")),
+            )
+            for r in self._mine()
+        ]
+
+    def mark(self, ref: str, *, stale: bool) -> None:
+        """See `Tracker`."""
+        (run,) = (run for run in self.shelf if run.ref == ref)
+        if stale:
+            run.tags["stale"] = "yes"
+        else:
+            run.tags.pop("stale", None)
+
+    def finished_anywhere(self, keys: Collection[str]) -> dict[str, str]:
+        """See `Tracker`."""
+        done = [r for r in self.shelf if r.status == "finished" and r.card.key in keys]
+        return {r.card.key: r.ref for r in reversed(done)}
+
+    def start(self, card: Card) -> MemoryRun:
+        """See `Tracker`."""
+        for run in self._mine():
+            if (run.card.arm, run.card.key) == (card.arm, card.key):
+                if run.card.imported != card.imported:
+                    self.drop(run.ref)
+                    continue
+                run.status = "running"
+                return run
+        number = 1 + max((int(run.ref.removeprefix("run-")) for run in self.shelf), default=-1)
+        run = MemoryRun(f"run-{number}", self.study, card)
+        self.shelf.append(run)
+        return run
+
+    def drop(self, ref: str) -> None:
+        """See `Tracker`."""
+        self.shelf[:] = [run for run in self.shelf if run.ref != ref]
+
+    def rows(self, refs: Sequence[str], metrics: Collection[str] | None = None) -> list[Row]:
+        """See `Tracker`."""
+        found = (row for run in self.shelf if run.ref in refs for row in run.values)
+        return sorted(row for row in found if metrics is None or row.metric in metrics)
+
+    def file(self, ref: str, name: str, folder: Path) -> Path | None:
+        """See `Tracker`."""
+        (run,) = [run for run in self.shelf if run.ref == ref]
+        if name not in run.files:
+            return None
+        (folder / name).write_bytes(run.files[name])
+        return folder / name
+
+    def files_of(self, ref: str) -> str:
+        """See `Tracker`."""
+        return f"memory of {ref}"
+
+    def publish(self, note: str, files: Mapping[str, bytes]) -> None:
+        """See `Tracker`."""
+        self.note, self.files = note, self.files | dict(files)
+
+    def close(self, status: Status) -> None:
+        """See `Tracker`."""
+        self._interrupt_running()

@@ -1,0 +1,468 @@
+"""Launch a search: ask for trials, train them to the next point, decide, record. What is finished stays finished.
+
+The order of writing makes a kill at any moment harmless: a trial's result goes to the log first, then to Optuna, then
+its checkpoints are dropped. Whatever the kill left open is taken up by the next launch from its checkpoint.
+"""
+
+import hashlib
+import math
+import shlex
+import shutil
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from io import StringIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+from ruamel.yaml import YAML
+
+from pipelines.execution.progress import Board, StopFile, board, print_table
+from pipelines.execution.ray_settings import set_up_ray
+from pipelines.execution.run import BAD, DONE, FAILED, Interrupts, guarded, missing_devices
+from pipelines.specs.search import Search
+from pipelines.specs.source_file import another, remember
+from pipelines.tracking.plan import read_commit
+from pipelines.tracking.tracker import Card, RunLog, Status, StudyCard, Tracker
+from pipelines.tuning.best_params import file_name, stem, winner_yaml, write_text
+from pipelines.tuning.trials import OBJECTIVE, Asked, BaseStorage, Ledger, explained, look, opened, storage_url
+from pipelines.workspace.addresses import without_password
+from pipelines.workspace.best_effort import decoration
+from pipelines.workspace.errors import InputError, visible
+from pipelines.workspace.terminal import terminal
+from pipelines.workspace.work_folder import Checkpoints, Home, StoreError
+from reports.data.escaping import markdown, prose
+from rhmc.types import Metrics
+
+if TYPE_CHECKING:
+    from pipelines.tracking.mlflow_tracker import MlflowTracker
+    from pipelines.tuning.ray_workers import Failed, TrialJob
+
+PATIENCE = 1.0  # seconds between two looks at whether Ctrl-C was pressed
+
+
+class Workers(Protocol):
+    """Who trains. See `pool.Pool`."""
+
+    @property
+    def free(self) -> int: ...
+
+    def begin(self, job: "TrialJob") -> None: ...
+
+    def next(self, timeout: float) -> "dict[str, dict[str, Any] | Failed]": ...
+
+    def go_on(self, key: str) -> None: ...
+
+    def end(self, key: str) -> None: ...
+
+
+def run_search(search: Search, home: Path, out: Path | None = None) -> int:
+    """Bring a search to its end: keep what is finished, take up what was interrupted, try the rest.
+
+    Args:
+        search: the plan.
+        home: the work folder.
+        out: where the winners go; `found` beside the search's file if None, and the work folder where the search was
+            changed by overrides: a trial of the tool does not replace what was found in earnest.
+
+    Returns:
+        0 every trial is finished or pruned, 1 some failed, 2 something is in the way, 130 interrupted, 143 terminated.
+    """
+
+    def launch(place: Home, interrupts: Interrupts) -> int:
+        with opened(place) as storage:
+            assert storage is not None
+            return _launch(search, place, storage, out or found_folder(search, place), interrupts)
+
+    devices = {arm.setting.trainer.device: name for name, arm in search.arms.items()}
+    if faults := list(missing_devices(devices.items())):
+        raise InputError(*faults)
+    for remark in search.remarks:
+        print(f"note: {remark}", file=sys.stderr)
+    return guarded(home, [(search.name, search.profile)], launch)
+
+
+def found_folder(search: Search, home: Home) -> Path:
+    """Where the winners go."""
+    return plots_folder(search, home) / "found" if search.overrides else Path(search.file).parent / "found"
+
+
+def plots_folder(search: Search, home: Home) -> Path:
+    """Where the plots go."""
+    return home.root / "searches" / f"{search.name}-{search.profile}"
+
+
+def _launch(search: Search, home: Home, storage: BaseStorage, out: Path, interrupts: Interrupts) -> int:
+    from pipelines.tracking.mlflow_tracker import MlflowTracker  # 3 s: only when something is launched
+
+    url = storage_url(home)
+    tracker = MlflowTracker(search_card(search), home)
+    status: Status = "interrupted"
+    try:
+        with explained(url), board(terminal()) as display:
+            if remark := another(home, search.name, search.profile, search.file):
+                display.say(remark)
+            remember(home, search.name, search.profile, search.file)
+            for remark in tracker.remarks:
+                display.say(remark)
+            ledgers = [Ledger(search, arm, storage) for arm in search.arms]
+            for ledger in ledgers:
+                again = ledger.take_up()
+                _clear(search, ledger, home)
+                display.say(f"{ledger.arm}: {ledger.closed} of {search.trials} trials are done, {again} are taken up")
+            if any(ledger.left for ledger in ledgers):
+                _train(search, ledgers, Book(search, tracker, display), home, interrupts)
+            whole = not any(ledger.left or ledger.live for ledger in ledgers)
+            for ledger in ledgers if not whole else []:
+                ledger.take_up()
+            written = results(search, ledgers, tracker, home, out if whole else None, display.say)
+        failed = any(ledger.counts()["failed"] for ledger in ledgers)
+        status = "interrupted" if not whole else "failed" if failed else "finished"
+    finally:
+        tracker.close(status)
+    _summary(search, ledgers, tracker, written, whole)
+    return {"finished": DONE, "failed": FAILED}.get(status, interrupts.code)
+
+
+def _clear(search: Search, ledger: Ledger, home: Home) -> None:
+    """Remove what a launch left that was killed between closing a trial and removing its checkpoints."""
+    for asked in ledger.over():
+        Checkpoints(home.checkpoints(trial_card(search, asked, "").key)).clear_unused()
+
+
+def _train(search: Search, ledgers: Sequence[Ledger], book: "Book", home: Home, interrupts: Interrupts) -> None:
+    set_up_ray()
+    from pipelines.execution.ray_driver import ray_session  # 3 s
+    from pipelines.tuning.ray_workers import Pool
+
+    scratch = home.scratch(search.name, search.profile)
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir(parents=True)
+    stop, resources = scratch / "stop", search.resources
+    name = home.name(search.name, search.profile)
+    session = ray_session(resources.concurrent, resources.cpus, name, home.root)
+    try:
+        with session as remarks, interrupts.go_to(stop):
+            for remark in remarks:
+                book.board.say(remark)
+            Drive(search, ledgers, Pool(resources.concurrent, resources.cpus), book, home, stop).run()
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+@dataclass
+class Running:
+    """A trial that is being trained."""
+
+    ledger: Ledger
+    asked: Asked
+    folder: Path  # of its checkpoints
+    points: int = 0  # of its curve so far
+
+
+class Drive:
+    """Asks, trains and tells until the budget is spent or `stop` exists.
+
+    Args:
+        search: the plan.
+        ledgers: of every arm.
+        pool: who trains.
+        book: the log.
+        home: where checkpoints lie.
+        stop: a file: once it exists, nothing new begins, and each trial saves itself at its next point.
+    """
+
+    def __init__(
+        self, search: Search, ledgers: Sequence[Ledger], pool: Workers, book: "Book", home: Home, stop: Path
+    ) -> None:
+        self.search, self.ledgers, self.pool, self.book = search, ledgers, pool, book
+        self.home, self.stop = home, StopFile(stop, book.board)
+        self.running: dict[str, Running] = {}
+
+    def run(self) -> None:
+        """To the end of the budget, or to the last trial that saved itself."""
+        self._fill()
+        while self.running:
+            for key, result in self.pool.next(PATIENCE).items():
+                self._take(key, result)
+            self._fill()
+
+    def _fill(self) -> None:
+        """Keep every worker busy; the arm that has most left to try goes first, so that all advance together."""
+        while not self.stop.exists() and self.pool.free:  # looked for first: it is announced while all are busy too
+            ledger = max(self.ledgers, key=lambda one: one.left)
+            if not ledger.left:
+                return
+            asked = ledger.ask()
+            if asked is not None:
+                self._begin(ledger, asked)
+
+    def _begin(self, ledger: Ledger, asked: Asked) -> None:
+        key = self.book.start(asked)
+        folder = self.home.checkpoints(key)
+        self.running[key] = Running(ledger, asked, folder)
+        self.pool.begin(
+            {
+                "key": key,
+                "spec": asked.setting.canonical(),
+                "seeds": self.search.seed_list(),
+                "folder": str(folder),
+                "checkpoint_every": self.search.resources.checkpoint_every,
+                "stop": str(self.stop.path),
+            }
+        )
+
+    def _take(self, key: str, result: "dict[str, Any] | Failed") -> None:
+        """What a worker reports of a trial."""
+        one = self.running[key]
+        if not isinstance(result, dict):
+            self._end(key)
+            self.book.fail(key, one.asked, result.error, result.trace)
+            one.ledger.fail(one.asked, result.error)
+            return
+        if "died" in result:
+            self.book.died(one.asked)
+            return
+        if why := self._points(key, one, result["points"]):
+            self._give_up(key, one, why)
+        elif result.get("diverged"):  # a result of these values: tried again, it would be the same
+            self._give_up(key, one, result["error"], "failed")
+        elif result["stopped"]:
+            self._end(key)
+            self.book.interrupt(key, one.asked)
+        elif result["done"]:
+            self._end(key)
+            self._complete(key, one, result["points"][-1])
+        else:
+            self.pool.go_on(key)
+
+    def _give_up(self, key: str, one: Running, why: str, status: Status = "finished") -> None:
+        """Prune a trial; `status` is that of its log."""
+        self._end(key)
+        self.book.prune(key, one.asked, why, status)
+        one.ledger.prune(one.asked, why)
+        Checkpoints(one.folder).clear()
+
+    def _points(self, key: str, one: Running, points: Sequence[Metrics]) -> str:
+        """Take in points one by one, so that a trial that continues with many is given up where it would have been.
+
+        Returns:
+            Why the trial should be given up; nothing if it should not.
+        """
+        for point in points:
+            why = one.ledger.report(one.asked, point, one.points)
+            self.book.points(key, one.asked, [point])
+            one.points += 1
+            if why:
+                return why
+        return ""
+
+    def _complete(self, key: str, one: Running, last: Metrics) -> None:
+        returns = [last[f"seeds/{seed}"] for seed in self.search.seed_list()]
+        self.book.complete(key, one.asked, last["step"], math.fsum(returns) / len(returns))
+        one.ledger.complete(one.asked, returns)
+        Checkpoints(one.folder).clear()
+
+    def _end(self, key: str) -> None:
+        self.pool.end(key)
+        del self.running[key]
+
+
+# The log
+
+
+class Book:
+    """Keeps the log and the board in step with the trials: a run for each, its curve the mean over the seeds.
+
+    Args:
+        search: whose.
+        tracker: the log.
+        display: the board.
+    """
+
+    def __init__(self, search: Search, tracker: Tracker, display: Board) -> None:
+        self.search, self.tracker, self.board = search, tracker, display
+        self.commit, why = read_commit()
+        if why:
+            display.say(f"the commit is logged as unknown: {why}")
+        self.logs: dict[str, RunLog] = {}
+
+    def start(self, asked: Asked) -> str:
+        """A trial begins or continues; returns its key, which names it in the log and in the checkpoints."""
+        card = trial_card(self.search, asked, self.commit)
+        log = self.logs[card.key] = self.tracker.start(card)
+        log.tag("trial", str(asked.place))
+        log.text("config.yaml", self._yaml(asked, card))
+        self.board.start(self._name(asked), self.search.steps)
+        return card.key
+
+    def _yaml(self, asked: Asked, card: Card) -> str:
+        head = {"search": self.search.name, "profile": self.search.profile, "arm": asked.arm, "trial": asked.place}
+        names = {"fingerprint": card.fingerprint, "commit": card.commit, "seeds": self.search.seed_list()}
+        out = StringIO()
+        YAML().dump(head | names | asked.setting.model_dump(mode="json"), out)
+        return out.getvalue()
+
+    def points(self, key: str, asked: Asked, points: list[Metrics]) -> None:
+        """New points of a trial's curve."""
+        self.logs[key].log(points)
+        self.board.points(self._name(asked), points)
+
+    def complete(self, key: str, asked: Asked, step: float, value: float) -> None:
+        """A trial ended: its value is the metric `objective`, which a pruned one has not."""
+        self.logs[key].log([{"step": step, "objective": value}])
+        self._end(key, asked, "complete", "finished", f"objective {value:.2f}")
+
+    def prune(self, key: str, asked: Asked, why: str, status: Status) -> None:
+        """A trial is given up."""
+        if status == "failed":
+            self.logs[key].tag("error", why)
+        self._end(key, asked, "pruned", status, f"pruned, {why}")
+
+    def interrupt(self, key: str, asked: Asked) -> None:
+        """A trial saved itself for the next launch."""
+        self._end(key, asked, "interrupted", "interrupted", "stopped; the next launch continues it")
+
+    def died(self, asked: Asked) -> None:
+        """The process that trained a trial is gone; another one continues it."""
+        self.board.say(f"{self._name(asked)}: its worker died; another one continues it")
+
+    def fail(self, key: str, asked: Asked, error: str, trace: str) -> None:
+        """A trial raised: keep why, go on with the others."""
+        self.logs[key].tag("error", error)
+        self.logs[key].text("error.txt", trace)
+        self._end(key, asked, "failed", "failed", f"failed: {error}")
+
+    def _end(self, key: str, asked: Asked, state: str, status: Status, text: str) -> None:
+        log = self.logs.pop(key)
+        log.tag("state", state)
+        log.finish(status)
+        self.board.end(self._name(asked), text)
+
+    def _name(self, asked: Asked) -> str:
+        return f"{self.search.name} / {asked.name}"
+
+
+def trial_card(search: Search, asked: Asked, commit: str) -> Card:
+    """A trial as its log shows it. Two trials with the same values are two runs."""
+    parts = (asked.setting.stated(), str(search.seed_list()), str(asked.place), search.identity(asked.arm))
+    spec_id = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:12]
+    kinds = asked.setting.algo.kind, asked.setting.env.kind
+    params = {"method": kinds[0]} | {f"algo.{name}": str(value) for name, value in asked.params.items()}
+    return Card(asked.arm, search.seed_list()[0], spec_id, search.code(asked.arm), *kinds, commit, params, asked.place)
+
+
+def search_card(search: Search) -> StudyCard:
+    """The search as its experiment shows it."""
+    seeds = search.seed_list()
+    spaces = [
+        f"- {markdown(name)}: " + ", ".join(f"`{key}` {markdown(str(one))}" for key, one in arm.space.items())
+        for name, arm in search.arms.items()
+    ]
+    note = (
+        f"{prose(search.question)}\n\n"
+        f"Search, profile `{search.profile}`: every arm has {search.trials} trials of {len(seeds)} seeds "
+        f"({seeds[0]} to {seeds[-1]}) and {search.steps:,} environment steps each. Sampler {search.sampler.kind}, "
+        f"pruner {search.pruner.kind}.\n\n" + "\n".join(spaces) + "\n\nA run is a trial: its curve is the mean over "
+        "its seeds, `objective` the mean of their final returns. Pruned trials have no `objective`."
+    )
+    params = {name: [f"algo.{setting}" for setting in arm.space] for name, arm in search.arms.items()}
+    return StudyCard(search.name, search.profile, note, params, list(search.arms))
+
+
+# Results
+
+
+class Written(NamedTuple):
+    """Files that a launch left."""
+
+    winners: list[Path]
+    plots: list[Path]
+
+
+def results(
+    search: Search,
+    ledgers: Sequence[Ledger],
+    tracker: Tracker,
+    home: Home,
+    out: Path | None,
+    say: Callable[[str], None] = lambda _: None,
+) -> Written:
+    """Write the plots, and the winners once the budget is spent (`out` is given); keep all of them with the log.
+
+    A plot that cannot be drawn, or not be shown in the log, is left out, and that is said.
+    """
+    written = Written([], [])
+    for ledger in ledgers:
+        title = f"{search.name} ({search.profile}): {ledger.arm}"
+        with decoration(f"{ledger.arm}: plots", say):
+            from pipelines.tuning.search_plots import plots
+
+            written.plots.extend(plots(ledger.study, title, plots_folder(search, home) / stem(ledger.arm)))
+        best = ledger.best()
+        if out is not None and best is not None:
+            file = out / file_name(search, ledger.arm)
+            write_text(file, winner_yaml(search, ledger.arm, best, ledger.counts()))
+            written.winners.append(file)
+    files = (*written.plots, *written.winners)
+    with decoration(f"{search.name}: overview in the log", say):
+        tracker.publish(search_card(search).note, {file.name: file.read_bytes() for file in files})
+    return written
+
+
+def _summary(
+    search: Search, ledgers: Sequence[Ledger], tracker: "MlflowTracker", written: Written, whole: bool
+) -> None:
+    console = terminal()
+    console.print()
+    print_table(console, HEADER, [_row(ledger) for ledger in ledgers])
+    lines = [_best_line(ledger) for ledger in ledgers]
+    lines += [f"winner: {file}" for file in written.winners]
+    lines += [f"plot:   {file}" for file in written.plots]
+    lines += [f"look:   {tracker.where()}", f"        experiment {tracker.name!r} in {without_password(tracker.uri)}"]
+    changes = [word for text in search.overrides for word in ("--set", text)]
+    again = shlex.join([search.file, "--profile", search.profile, *changes])
+    lines += [] if whole else [f"next:   rhmc search run {again}   (continues)"]
+    console.print("\n".join(map(visible, lines)), soft_wrap=True)
+
+
+HEADER = ["arm", "trials", "complete", "pruned", "running", "waiting", "failed", "missing", "best"]
+
+
+def _row(ledger: Ledger) -> list[str]:
+    counts, best = ledger.counts(), ledger.best()
+    numbers = [str(counts[name]) for name in HEADER[2:-1]]
+    return [ledger.arm, str(ledger.search.trials), *numbers, f"{best.value:.2f}" if best else "-"]
+
+
+def _best_line(ledger: Ledger) -> str:
+    best = ledger.best()
+    if best is None:
+        return f"{ledger.arm}: no trial is finished"
+    values = ", ".join(f"{name}={_short(value)}" for name, value in best.params.items())
+    return f"{ledger.arm}: {OBJECTIVE} {best.value:.2f} over {len(best.returns)} seeds in trial {best.place}: {values}"
+
+
+def _short(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def show_search(search: Search, home: Path) -> int:
+    """Print how far a search is: trials by state, the best so far, and those of other settings or code (stale).
+
+    Returns:
+        0 every trial is closed, 1 not, 2 something is in the way.
+    """
+    place = Home(home)
+    try:
+        with opened(place, write=False) as storage, explained(storage_url(place)):
+            if storage is None:
+                print(f"{search.name} ({search.profile}): nothing has been tried yet")
+                return FAILED
+            found = [look(search, arm, storage) for arm in search.arms]
+            print_table(terminal(), [*HEADER, "stale"], [[*_row(ledger), str(stale)] for ledger, stale in found])
+            print("\n".join(_best_line(ledger) for ledger, _ in found))
+            return DONE if all(ledger.closed >= search.trials for ledger, _ in found) else FAILED
+    except StoreError as error:
+        print(f"rhmc: {error}", file=sys.stderr)
+        return BAD

@@ -1,0 +1,253 @@
+"""Arms of one study against each other: pairs, performance profiles, probability of improvement, sample efficiency.
+
+All of it is over seeds. Every run of a study plays the same bank of episodes at its end, so the bank's luck is the same
+for all arms and cancels in a difference; single episodes are not exported, so there is nothing to pair below a seed.
+"""
+
+from collections.abc import Sequence
+from itertools import combinations
+from math import comb
+from textwrap import wrap
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from reports.data.frame import FINAL, Results
+from reports.data.stats import Interval, area, difference, first_at, holm, improvement, interval, welch
+from reports.render.canvas import Drawing, blank, foot, head, look, styled
+from reports.render.tables import MEASURED, NONE, Table, estimate, number, steps
+
+LETTERS, LONGEST = 44, 60  # of a name on a line of a legend, and beside a matrix
+MOST = 12  # arms of a matrix that can still be read
+LEVEL_SHARE = 0.9  # of the best arm's mean final return, where no scripted policy gives a level
+RULER = {"coverage": "best_window", "navigation": "nearest"}  # each agent alone, without learning
+
+
+class Pair(NamedTuple):
+    """Two arms. `p` is Welch's, `corrected` after Holm over all pairs of the study."""
+
+    first: str
+    second: str
+    difference: Interval
+    better: Interval
+    p: float
+    corrected: float
+
+
+class Level(NamedTuple):
+    """A return that counts as reached, and where it is from."""
+
+    value: float
+    words: str
+
+
+def compared(results: Results, study: str) -> list[str]:
+    """Arms with at least two finished seeds, best mean first."""
+    arms = [arm for arm in results.arms(study) if len(results.finals(study, arm)) > 1]
+    return sorted(arms, key=lambda arm: -float(results.finals(study, arm).mean()))
+
+
+def pairs(results: Results, study: str) -> list[Pair]:
+    """Every two arms, the better one first."""
+    found = list(combinations(compared(results, study), 2))
+    values = [(results.finals(study, a), results.finals(study, b)) for a, b in found]
+    p = np.array([welch(x, y) for x, y in values])
+    return [
+        Pair(a, b, difference(x, y), improvement(x, y), float(one), float(corrected))
+        for (a, b), (x, y), one, corrected in zip(found, values, p, holm(p), strict=True)
+    ]
+
+
+def pairs_table(results: Results, study: str) -> Table | None:
+    """The pairs as a table; None with fewer than two arms to compare."""
+    found = pairs(results, study)
+    if not found:
+        return None
+    numbers = [
+        {"study": study, "better": x.first, "other": x.second}
+        | {"difference": x.difference.value, "difference_low": x.difference.low, "difference_high": x.difference.high}
+        | {"probability": x.better.value, "probability_low": x.better.low, "probability_high": x.better.high}
+        | {"p_welch": x.p, "p_holm": x.corrected, "seeds": x.difference.n}
+        for x in found
+    ]
+    shown = [
+        {
+            "Higher mean": x.first,
+            "Other": x.second,
+            "Difference [95 %]": estimate(x.difference, lambda v: number(v, 2)),
+            "P(first better) [95 %]": estimate(x.better, lambda v: f"{v:.2f}"),
+            "p": _chance(x.p),
+            "p, Holm": _chance(x.corrected),
+            "Clear": "yes" if x.corrected < 0.05 else "no" if x.corrected >= 0.05 else NONE,
+            "Seeds": str(x.difference.n),
+        }
+        for x in found
+    ]
+    return Table(f"Pairs of arms, study {study}", pd.DataFrame(numbers), pd.DataFrame(shown), _pairs_note(found))
+
+
+def efficiency(results: Results, study: str) -> Table | None:
+    """Mean height of the learning curve, and steps to a level; None without finished runs."""
+    level = reference(results, study)
+    rows = [(arm, runs) for arm in results.arms(study) if len(runs := _learned(results, study, arm, level))]
+    if level is None or not rows:
+        return None
+    numbers, shown = [], []
+    for arm, runs in rows:
+        height, reached = interval(runs["area"].to_numpy()), runs["steps"].notna()
+        steps_to, all_reached = runs["steps"].median(), bool(reached.all())
+        numbers.append(
+            {"study": study, "arm": arm, "area": height.value, "area_low": height.low, "area_high": height.high}
+            | {"level": level.value, "reached": int(reached.sum()), "seeds": len(runs)}
+            | {"median_steps": steps_to if all_reached else np.nan}
+        )
+        shown.append(
+            {
+                "Arm": arm,
+                "Mean height of the curve [95 %]": estimate(height),
+                "Seeds that reach the level": f"{int(reached.sum())} of {len(runs)}",
+                "Steps to it, median": steps(steps_to) if all_reached else NONE,
+            }
+        )
+    note = (
+        f"Level: {number(level.value)}, {level.words}. Steps: to each finished seed's first evaluation at or above it, "
+        "given where every seed reaches it."
+    )
+    return Table(f"Sample efficiency, study {study}", pd.DataFrame(numbers), pd.DataFrame(shown), note)
+
+
+def time_to_level(results: Results, study: str) -> Table | None:
+    """Processor time to the level of `efficiency`; None where there is no level, or of no arm a time."""
+    level = reference(results, study)
+    found = {arm: _learned(results, study, arm, level) for arm in results.arms(study)}
+    medians = {arm: float(runs["seconds"].median(skipna=False)) for arm, runs in found.items() if len(runs)}
+    if level is None or np.isnan(list(medians.values())).all():
+        return None
+    numbers = pd.DataFrame({"study": study, "arm": list(medians), "median_seconds": list(medians.values())})
+    words = [NONE if np.isnan(x) else f"{x:.0f} s" for x in medians.values()]
+    shown = pd.DataFrame({"Arm": list(medians), "Processor time to it, median": words})
+    note = (
+        f"Level: {number(level.value)}, {level.words}. The share of a run's seconds that its steps to the level are, "
+        "given where every seed reaches it."
+    )
+    return Table(f"Processor time to the level, study {study}", numbers, shown, note, folder=MEASURED)
+
+
+def reference(results: Results, study: str) -> Level | None:
+    """The level of `efficiency`: each agent alone without learning, else 90 % of the best arm; None without runs."""
+    scores = results.yardsticks_of(study)
+    name = RULER.get(str(results.env(study).get("kind")), "")
+    if FINAL in scores and name in scores.index:
+        return Level(float(scores[FINAL][name]), f"what the scripted policy {name.replace('_', ' ')} gets")
+    means = [float(values.mean()) for arm in results.arms(study) if len(values := results.finals(study, arm))]
+    if not means or max(means) <= 0:
+        return None
+    return Level(LEVEL_SHARE * max(means), f"{100 * LEVEL_SHARE:g} % of the best arm's mean final return")
+
+
+def profile(results: Results, study: str) -> Drawing | None:
+    """Share of seeds whose final return is at or above a score, for every score; None with fewer than two arms."""
+    arms = [arm for arm in results.arms(study) if len(results.finals(study, arm)) > 1]
+    if len(arms) < 2:
+        return None
+    values = {arm: np.sort(results.finals(study, arm)) for arm in arms}
+    low, high = min(x[0] for x in values.values()), max(x[-1] for x in values.values())
+    margin = 0.03 * (high - low) or 1.0
+    grid = np.unique(np.concatenate([*values.values(), [low - margin, high + margin]]))
+    shares = {arm: above(x, grid) for arm, x in values.items()}
+    with styled():
+        figure = blank(9.0, 4.6)
+        head(figure, f"Performance profile, study {study}", "share of seeds that end at or above a score")
+        axes = figure.add_axes((0.075, 0.17, 0.6, 0.66))
+        lines, names = [], []
+        for arm in shares:
+            colour, dashes = look(arm, results.arms(study))
+            names.append("\n".join(wrap(f"{arm} ({len(values[arm])} seeds)", LETTERS)))
+            own = np.append(values[arm][:1], values[arm])  # drawn from its first seed to its last, lines apart
+            left = np.append(1.0, above(values[arm], np.nextafter(values[arm], np.inf)))
+            lines += axes.step(own, left, where="post", color=colour, linestyle=dashes, linewidth=1.8)
+        axes.set_xlabel("final return")
+        axes.set_ylabel("share of seeds")
+        axes.set_ylim(-0.02, 1.04)
+        figure.legend(lines, names, loc="upper left", bbox_to_anchor=(0.69, 0.85), frameon=False, fontsize=8)
+        foot(
+            figure,
+            "A line right of another at every height is better in distribution; lines that cross are not ordered.",
+        )
+    rows = [(arm, x, y, len(values[arm])) for arm, share in shares.items() for x, y in zip(grid, share, strict=True)]
+    return Drawing(figure, pd.DataFrame(rows, columns=["arm", "score", "share", "seeds"]))
+
+
+def above(values: NDArray[np.float64], scores: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Share of values at or above each score. values: (n,) ascending, scores: (k,)."""
+    return 1 - np.searchsorted(values, scores, side="left") / len(values)
+
+
+def matrix(results: Results, study: str) -> Drawing | None:
+    """Probability that a seed of the row's arm beats one of the column's; None with fewer than three arms, or many."""
+    arms = compared(results, study)
+    if not 3 <= len(arms) <= MOST:
+        return None
+    table = np.array([[_beats(results, study, a, b) for b in arms] for a in arms])
+    side = 0.52 * len(arms)
+    names = ["\n".join(wrap(arm, LONGEST)) for arm in arms]
+    longest, last = (max(map(len, text.split("\n"))) for text in ("\n".join(names), names[-1]))
+    left = 0.35 + 0.082 * longest
+    with styled():
+        figure = blank(max(left + side + 0.4 + 0.05 * last, 6.4), side + 1.5 + 0.055 * longest)
+        width, height = figure.get_size_inches()
+        head(figure, f"Probability of improvement, study {study}", "that a seed of the row beats one of the column")
+        axes = figure.add_axes((left / width, 0.45 / height, side / width, side / height))
+        axes.imshow(table, cmap="RdBu", vmin=-0.3, vmax=1.3, aspect="auto")
+        axes.grid(visible=False)
+        axes.set_xticks(range(len(arms)), names, rotation=35, ha="left", rotation_mode="anchor", fontsize=8)
+        axes.set_yticks(range(len(arms)), names, fontsize=8)
+        axes.xaxis.tick_top()
+        for (i, j), value in np.ndenumerate(table):
+            if i != j:
+                colour = "white" if abs(value - 0.5) > 0.45 else "black"
+                axes.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=7.5, color=colour)
+        foot(figure, "Blue: the row wins; red: the column. Intervals stand in the table of pairs.")
+    rows = [(a, b, table[i, j]) for i, a in enumerate(arms) for j, b in enumerate(arms) if i != j]
+    return Drawing(figure, pd.DataFrame(rows, columns=["arm", "against", "probability"]))
+
+
+def _beats(results: Results, study: str, a: str, b: str) -> float:
+    return 0.5 if a == b else improvement(results.finals(study, a), results.finals(study, b)).value
+
+
+def _learned(results: Results, study: str, arm: str, level: Level | None) -> pd.DataFrame:
+    """Of each finished seed: mean height of its curve, steps to the level, seconds to it (NaN where not reached)."""
+    points = results.curve(study, arm)
+    rows = []
+    for run in results.finished(study, arm).itertuples():
+        own = points[points["seed"] == run.seed]
+        if not len(own) or level is None:
+            continue
+        at, heights = own["step"].to_numpy(np.float64), own["value"].to_numpy(np.float64)
+        reached = first_at(at, heights, level.value)
+        rows.append((area(at, heights), reached, float(str(run.seconds)) * reached / at[-1] if at[-1] else np.nan))
+    return pd.DataFrame(rows, columns=["area", "steps", "seconds"])
+
+
+def _chance(p: float) -> str:
+    return NONE if np.isnan(p) else "< 0.001" if p < 0.001 else f"{p:.3f}"
+
+
+def _pairs_note(found: Sequence[Pair]) -> str:
+    least = min(x.difference.n for x in found)
+    note = (
+        "p: Welch's test over seeds; Holm: corrected for all pairs of this table. Intervals are of one pair each, not "
+        "corrected. All arms play the same final bank of episodes; single episodes are not exported, so the pairing is "
+        "of arms, not of episodes."
+    )
+    if least < 4:
+        note += f" With {least} seeds a side no test by ranks can come below p = {_rank_limit(least):.2g}."
+    return note
+
+
+def _rank_limit(n: int) -> float:
+    """The smallest two-sided p of a permutation of n against n."""
+    return 2 / comb(2 * n, n)

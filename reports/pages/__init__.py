@@ -1,0 +1,1 @@
+"""The report as files: gallery, page, and the build; no statistics."""

@@ -1,0 +1,287 @@
+"""Every figure of a report with its words: title, caption that says what to see, text for those who cannot see it.
+
+A figure that cannot be drawn leaves its place, with the reason: the numbers are in the tables.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import NamedTuple
+
+from reports.analyses import beyond, comparison, scaling
+from reports.analyses.scaling import Sweep
+from reports.data.drawn import Counterexample, Scenes
+from reports.data.escaping import stem
+from reports.data.frame import FINAL, Results
+from reports.data.paper import Curves, Paper
+from reports.render import diagrams, figures, scenes
+from reports.render.canvas import Drawing
+from reports.render.tables import describe_task, joined, number, steps
+
+PAPERS = "fig_"
+OWN = ("RHMC", "full")  # the paper's method
+Made = tuple[str, str, Drawing]  # caption, text for those who cannot see it, figure
+
+
+class Picture(NamedTuple):
+    """A figure of the report; `name` is that of its files."""
+
+    name: str
+    title: str
+    caption: str
+    alt: str
+    drawing: Drawing | None
+    study: str = ""
+    behind: str = ""  # the command that made its numbers, where it is not the study's own
+    fault: str = ""  # why it could not be drawn
+
+    @property
+    def heading(self) -> str:
+        """`Fig. 7. Title` for the paper's figures, the title alone for others."""
+        own = self.name.removeprefix(PAPERS)
+        return f"Fig. {own}. {self.title}" if self.name.startswith(PAPERS) and own.isdigit() else self.title
+
+
+def reason(error: Exception) -> str:
+    """What went wrong with a figure, on one line."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}".removesuffix(": ")
+
+
+def picture(
+    name: str, title: str, make: Callable[[], Made | None], study: str = "", behind: str = ""
+) -> Iterator[Picture]:
+    """The figure that `make` draws, none if that has no data for it, or its place if it fails."""
+    try:
+        made = make()
+    except Exception as error:
+        yield Picture(name, title, "", "", None, study, behind, reason(error))
+    else:
+        if made:
+            yield Picture(name, title, *made, study, behind)
+
+
+def gallery(results: Results, paper: Paper) -> list[Picture]:
+    """The paper's figures in their order, then what goes beyond it. What has no data is left out."""
+    drawn = [*_networks(results), *_states(results), *_scaling(results), *_counterexamples(results)]
+    known = {spec.study: name for name, spec in paper.figures.items()}
+    for study in results.studies:
+        spec = paper.figures[known[study]] if study in known else paper.curves_of(study, results.task(study))
+        drawn += _curves(results, spec, known.get(study, f"curves_{stem(study)}"))
+    own = sorted((p for p in drawn if p.name.startswith(PAPERS)), key=lambda p: _order(p.name))
+    return own + [p for p in drawn if not p.name.startswith(PAPERS)] + list(comparisons(results))
+
+
+def in_short(results: Results, paper: Paper) -> list[str]:
+    """What came out, a sentence for each of the paper's comparisons that has runs."""
+    lines = []
+    for spec in paper.figures.values():
+        arms = comparison.compared(results, spec.study)
+        own = next((arm for arm in OWN if arm in arms), None)
+        if own is None or len(arms) < 2:
+            continue
+        first = arms[0] if arms[0] != own else arms[1]
+        side = "ahead of" if arms[0] == own else "behind"
+        values = [number(float(results.finals(spec.study, arm).mean())) for arm in (own, first)]
+        budget = results.budget(spec.study)
+        place = f"{arms.index(own) + 1} of {len(arms)} arms"
+        head = f"{spec.title.partition(':')[0]}, {steps(budget) if budget else 'unknown'} steps"
+        lines.append(f"{head}: {own} ends at {values[0]} ({place} by the mean), {side} {first} at {values[1]}.")
+    return lines
+
+
+def study_gallery(results: Results, paper: Paper, study: str) -> list[Picture]:
+    """The figures of one study."""
+    spec = paper.curves_of(study, results.task(study))
+    return [
+        *_curves(results, spec, f"curves_{stem(study)}"),
+        *_sweep(results, study, f"scaling_{stem(study)}"),
+        *comparisons(results),
+    ]
+
+
+def comparisons(results: Results) -> Iterator[Picture]:
+    """What the paper does not have: assignments, performance profiles, probabilities of improvement, transfer."""
+    for study in results.studies:
+        made = f"rhmc assignments studies/{study.partition('@')[0]}.yaml --profile {results.profile}"
+        title = f"What is assigned while training, study {study}"
+        name = stem(study)
+        yield from picture(f"assignments_{name}", title, partial(_assigned, results, study), study, made)
+        title = f"Performance profile, study {study}"
+        yield from picture(f"profile_{name}", title, partial(_profile, results, study), study)
+        title = f"Probability of improvement, study {study}"
+        yield from picture(f"better_{name}", title, partial(_better, results, study), study)
+    title = "Trained once, played with other numbers"
+    yield from picture("transfer", title, lambda: _moved(results), "-", "rhmc transfer")
+
+
+def _assigned(results: Results, study: str) -> Made | None:
+    watched = beyond.fig_assignments(results, study)
+    caption = (
+        "The mechanism behind the ablation: see whether pairs grow fewer, whether two agents are sent to one "
+        "target ever less often, and whether targets are left to nobody."
+    )
+    alt = f"Three line charts against environment steps for {joined(beyond.assigning(results, study))}."
+    return (caption, alt, watched) if watched else None
+
+
+def _profile(results: Results, study: str) -> Made | None:
+    profile = comparison.profile(results, study)
+    caption = "See which line stays furthest right: that arm's seeds end highest, whatever score one asks for."
+    alt = f"Step chart for {joined(comparison.compared(results, study))}."
+    return (caption, alt, profile) if profile else None
+
+
+def _better(results: Results, study: str) -> Made | None:
+    matrix, arms = comparison.matrix(results, study), comparison.compared(results, study)
+    if matrix is None:
+        return None
+    caption = f"Rows are sorted by mean: the bluer the row, the more often it wins. On top: {arms[0]}."
+    alt = f"Matrix of the probability that a seed of one arm beats one of another, for {joined(arms)}."
+    return caption, alt, matrix
+
+
+def _moved(results: Results) -> Made | None:
+    moved = beyond.fig_transfer(results)
+    caption = (
+        "No step of training with the other numbers: see how far a policy follows the planner as sensors or "
+        "targets are added, and where it falls below sensors that each seek their own best window."
+    )
+    return (caption, "Two line charts of return against numbers of sensors and of targets.", moved) if moved else None
+
+
+def curve_caption(results: Results, study: str) -> str:
+    """What to see in the curves of a study, from its numbers."""
+    arms = comparison.compared(results, study)
+    waiting = [arm for arm in results.arms(study) if not len(results.finals(study, arm))]
+    words = f" No finished run yet: {joined(waiting)}." if waiting else ""
+    if not arms:
+        return f"No arm has two finished seeds yet.{words}"
+    means = {arm: float(results.finals(study, arm).mean()) for arm in arms}
+    first = f"{arms[0]} ends highest, at {number(means[arms[0]])}"
+    second = f"; next is {arms[1]} at {number(means[arms[1]])}" if len(arms) > 1 else ""
+    return f"See the order at the right edge: {first}{second}.{_against_scripts(results, study, means)}{words}"
+
+
+def _against_scripts(results: Results, study: str, means: dict[str, float]) -> str:
+    level = comparison.reference(results, study)
+    if level is None or FINAL not in results.yardsticks_of(study):
+        return ""
+    over = [arm for arm, mean in means.items() if mean > level.value]
+    count = "None" if not over else "All" if len(over) == len(means) else f"{len(over)} of {len(means)} arms"
+    return f" {count} end{'s' if len(over) == 1 or not over else ''} above {number(level.value)}, {level.words}."
+
+
+def _curves(results: Results, spec: Curves, name: str) -> Iterator[Picture]:
+    """All arms in one frame, and where they are many each in a frame of its own."""
+
+    def whole() -> Made | None:
+        drawing = figures.learning_curves(results, spec)
+        return (curve_caption(results, spec.study), _finals(results, spec.study), drawing) if drawing else None
+
+    def each() -> Made | None:
+        drawing = figures.each_arm(results, spec)
+        caption = "The same curves one by one: see the width of each band, and where a curve bends down again."
+        return (caption, f"Small line charts. {_finals(results, spec.study)}", drawing) if drawing else None
+
+    yield from picture(name, spec.title, whole, spec.study)
+    yield from picture(f"{name}_arms", f"{spec.title}, arm by arm", each, spec.study)
+
+
+def _finals(results: Results, study: str) -> str:
+    """The curves of a study in words."""
+    finals = [f"{arm} {number(float(x.mean()))}" for arm in results.arms(study) if len(x := results.finals(study, arm))]
+    words = f"Line chart of return against environment steps, {describe_task(results.env(study))}. "
+    return words + (f"Final returns: {', '.join(finals)}." if finals else "No run is finished.")
+
+
+def _networks(results: Results) -> Iterator[Picture]:
+    if not results.modules:
+        return
+    builds = results.modules
+    sizes = "; ".join(f"{n.role}, {b.encoder}: {n.parameters:,}" for b in builds for n in b.networks)
+    alt = f"Diagram of RHMC's networks. Parameters: {sizes}."
+    caption = "Two levels and what runs between them: see how small the networks are, and that the critics see more."
+    yield from picture("fig_1", "Architecture of RHMC", lambda: (caption, alt, diagrams.architecture(builds)))
+    for name, role, level in (("fig_2", "coordinator", "High"), ("fig_3", "executor", "Low")):
+        title = f"{level} level: the {role}{'s' if role == 'executor' else ''}, layer by layer"
+
+        def layers(role: str = role, title: str = title) -> Made:
+            words = "Every layer as it ran: the fully connected reading above, the pairwise one below, which pools over"
+            return f"{words} pairs.", f"Diagram of the {role}'s layers. {alt}", diagrams.level(builds, role, title)
+
+        yield from picture(name, title, layers)
+
+
+def _states(results: Results) -> Iterator[Picture]:
+    found = results.scenes
+    if found is None:
+        return
+    title = "Regulation: Algorithm 1 on a real instance"
+    yield from picture("fig_4", title, lambda: _regulation(found))
+    caption = "An episode's first and last state. The task is done when every cross lies under an agent of its own."
+    alt = "Two plots of agents and landmarks in the plane, before and after an episode."
+    yield from picture("fig_5", "Cooperative navigation", lambda: (caption, alt, scenes.navigation(found.navigation)))
+    title = "Sensor coverage with different numbers of sensors"
+    yield from picture("fig_8", title, lambda: _sensors(found))
+
+
+def _regulation(found: Scenes) -> Made:
+    ours, best = found.regulation.paths.algorithm_1.reward, found.regulation.paths.optimum.reward
+    caption = (
+        f"A column is an agent, a box one of its options. Algorithm 1 settles on {number(ours, 2)} (orange) where "
+        f"{number(best, 2)} was to be had (blue): it keeps one set of targets per option, chosen by count."
+    )
+    alt = f"Graph of options by agent with two paths: Algorithm 1, reward {number(ours, 2)}; optimum {number(best, 2)}."
+    return caption, alt, scenes.regulation(found.regulation)
+
+
+def _sensors(found: Scenes) -> Made:
+    seen = ", ".join(f"{scenes.covered(s)} of {len(s.targets)} with {s.agents}" for s in found.coverage)
+    caption = (
+        "Five targets and more and more sensors, each case an episode of its own: see how far apart they stand, how "
+        "little a sector of 90 degrees takes in, and how sectors begin to overlap."
+    )
+    alt = f"Plots of sensors with their sectors of view and targets. Targets seen: {seen} sensors."
+    return caption, alt, scenes.coverage(found.coverage)
+
+
+def _counterexamples(results: Results) -> Iterator[Picture]:
+    found = results.scenes.counterexamples if results.scenes else ()
+    if found:
+        title = "Theorem 1: the smallest counterexamples"
+        yield from picture("counterexamples", title, lambda: _missed(found), "-", "rhmc drawings")
+
+
+def _missed(found: Sequence[Counterexample]) -> Made:
+    rewards = [(number(case.paths.algorithm_1.reward, 2), number(case.paths.optimum.reward, 2)) for case in found]
+    caption = (
+        "Theorem 1 says that Algorithm 1 finds the largest reward. See where the orange way, which keeps the first of "
+        f"two sets of equal size, leaves the blue one: {joined([f'{a} instead of {b}' for a, b in rewards])}."
+    )
+    alt = "Graphs of options by agent with two paths: " + "; ".join(
+        f"Algorithm 1, reward {ours}, optimum {best}" for ours, best in rewards
+    )
+    return caption, f"{alt}.", scenes.counterexamples(found)
+
+
+def _scaling(results: Results) -> Iterator[Picture]:
+    yield from _sweep(results, scaling.STUDY, "fig_9")
+
+
+def _sweep(results: Results, study: str, name: str) -> Iterator[Picture]:
+    found = scaling.sweep(results, study)
+    if found:
+        yield from picture(name, "Final return by number of agents", lambda: _by_agents(results, found), study)
+
+
+def _by_agents(results: Results, found: Sweep) -> Made | None:
+    drawing = scaling.figure(results, found)
+    caption = (
+        "See whether one line stays on top at every number of agents, and whether it ever falls as they are added."
+    )
+    alt = f"Line chart of final return against {joined(map(str, found.counts))} agents for {joined(found.arms)}."
+    return (caption, alt, drawing) if drawing else None
+
+
+def _order(name: str) -> tuple[int, str]:
+    digits = name.removeprefix(PAPERS).partition("_")[0]
+    return (int(digits) if digits.isdigit() else 99, name)

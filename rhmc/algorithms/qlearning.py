@@ -1,0 +1,116 @@
+"""Action values that every agent acts on alone, learned through a mixer: the common part of IQL, VDN and QMIX.
+
+The mixer turns the values of the chosen actions, (B, N), into (B, K) values that are learned towards the team's reward:
+itself (IQL, K = N), their sum (VDN, K = 1), a monotone function of them (QMIX, K = 1). Double Q: the network chooses
+the next action, its slow copy values it.
+"""
+
+import torch
+from pydantic import Field
+from torch import Generator, Tensor, nn
+from torch.nn.functional import mse_loss
+
+from rhmc.learning import checkpoint
+from rhmc.learning.experience import Experience
+from rhmc.learning.learner import Learner, Learners, pack_step, taken, unpack
+from rhmc.learning.normalisation import Standard
+from rhmc.learning.schedules import linear
+from rhmc.learning.settings import OffPolicy, Slow, Standardised
+from rhmc.networks.nets import ENCODERS, Sizes, team
+from rhmc.types import Batch, Carry, Obs, Spec, State, Transition
+
+
+class Config(Slow, Standardised, OffPolicy):
+    """Settings; lr and gamma are the paper's."""
+
+    double: bool = Field(True, description="double Q; false: the slow copy chooses too")
+    epsilon_end: float = Field(0.05, ge=0, le=1)
+    epsilon_steps: int = Field(50_000, ge=1)
+
+
+class Values(nn.Module):
+    """Action values of every agent, (B, N, actions), and what mixes them."""
+
+    def __init__(self, agents: nn.Module, mixer: nn.Module) -> None:
+        super().__init__()
+        self.agents, self.mixer = agents, mixer
+
+    def forward(self, obs: Obs) -> Tensor:
+        return self.agents(obs)
+
+    def mixed(self, obs: Obs, action: Tensor) -> Tensor:
+        """Mixed values of a joint action (B, N): (B, K)."""
+        return self.mixer(obs, taken(self(obs), action))
+
+
+class QLearning:
+    """See the module. Discrete actions only. `mixer` maps an observation and (B, N) values to (B, K)."""
+
+    def __init__(self, cfg: Config, spec: Spec, rng: Generator, mixer: nn.Module) -> None:
+        self.cfg, self.spec, self.rng = cfg, spec, rng
+        sizes, encoder = Sizes.of(spec), ENCODERS[cfg.encoder]
+        agents = team(lambda: encoder.local(sizes, cfg.hidden, spec.actions), spec.agents, share=cfg.share)
+        self.q = Learner(Values(agents, mixer).to(rng.device), lr=cfg.lr, polyak=cfg.polyak, clip=cfg.grad_clip)
+        self.standard = Standard(cfg.standardise, rng.device)
+        self.experience = Experience(cfg, rng)
+
+    # Acting
+
+    def carry(self, batch: int) -> Carry:
+        """Nothing is remembered."""
+        return {}
+
+    def act(self, obs: Obs, carry: Carry, rng: Generator, *, explore: bool) -> tuple[Tensor, Carry, Batch]:
+        """Greedy action (B, N), or epsilon-greedy when exploring."""
+        action = self.q.net(obs).argmax(-1)
+        if explore:
+            epsilon = linear(1.0, self.cfg.epsilon_end, self.cfg.epsilon_steps, self.experience.steps)
+            random = torch.randint(self.spec.actions, action.shape, generator=rng, device=rng.device)
+            flip = torch.rand(action.shape, generator=rng, device=rng.device) < epsilon
+            action = torch.where(flip, random, action)
+        return action, carry, {}
+
+    # Learning
+
+    def observe(self, transition: Transition) -> None:
+        """Store one row per environment."""
+        t = transition
+        self.standard.see_rewards(t.reward)
+        self.experience.add(pack_step(t), len(t.reward))
+
+    def update(self) -> Batch:
+        """The updates that are due."""
+        logs: Batch = {}
+        for rows in self.experience.due():
+            loss, logs = self._loss(rows)
+            logs["grad_norm"] = self.q.update(loss)
+        return logs
+
+    def _loss(self, rows: Batch) -> tuple[Tensor, Batch]:
+        chosen = self.q.net.mixed(unpack(rows), rows["action"])
+        with torch.no_grad():
+            after = unpack(rows, "next_")
+            best = (self.q.net if self.cfg.double else self.q.slow)(after).argmax(-1)
+            value = self.standard.value(self.q.slow.mixed(after, best))
+            live = (~rows["terminal"]).float().unsqueeze(-1)
+            target = self.standard.reward(rows["reward"]).unsqueeze(-1) + self.cfg.gamma * live * value
+            self.standard.see_returns(target)
+        loss = mse_loss(chosen, self.standard.target(target).expand_as(chosen))
+        return loss, {"td_loss": loss, "q": chosen.mean()}
+
+    def learners(self) -> Learners:
+        """The values."""
+        return [self.q]
+
+    # Checkpoints
+
+    def _parts(self) -> checkpoint.Parts:
+        return {"q": self.q, "experience": self.experience, "standard": self.standard}
+
+    def state_dict(self) -> State:
+        """Network, replay, statistics and generator."""
+        return checkpoint.save(self.rng, self._parts())
+
+    def load_state_dict(self, state: State) -> None:
+        """Continue from `state_dict`."""
+        checkpoint.load(state, self.rng, self._parts())

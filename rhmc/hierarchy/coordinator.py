@@ -1,0 +1,110 @@
+"""The high level: one policy that assigns targets to agents (sections 4.2 and 4.4, Eq. 6 to 9).
+
+Two gradients for the binary assignment. `ddpg` is Eq. 9 through a straight-through relaxed Bernoulli: it follows the
+critic's slope at assignments of 0 and 1, where the critic was never asked between them. `counterfactual` replaces that
+slope by the finite difference of the critic per pair, Q(s, g with g_ij = 1) - Q(s, g with g_ij = 0).
+"""
+
+from typing import Literal
+
+import torch
+from pydantic import Field
+from torch import Generator, Tensor, nn
+from torch.nn.functional import mse_loss, softplus
+
+from rhmc.learning import checkpoint
+from rhmc.learning.learner import Learner, Learners, unpack
+from rhmc.learning.normalisation import Scale, Standard
+from rhmc.learning.settings import Slow
+from rhmc.networks.nets import ENCODERS, PairNet, Sizes, append
+from rhmc.networks.sampling import bernoulli, mix, relaxed_bernoulli
+from rhmc.types import Batch, Obs, Spec, State
+
+
+class Config(Slow):
+    """Settings of the high level; lr and gamma are the paper's."""
+
+    coordinator: Literal["ddpg", "counterfactual"] = "ddpg"
+    entropy: float = Field(0.2, ge=0, description="weight of the assignment's entropy, for advantages of deviation 1")
+    gamma_h: float = Field(0.99, ge=0, le=1, description="per assignment period")
+    standardise_h: Scale = Field("none", description="as `standardise` of other methods, for the coordinator")
+    flip: float = Field(0.05, ge=0, le=1, description="share of pairs assigned at random while exploring")
+    batch_h: int = Field(256, ge=1, description="rows of an update")
+
+
+class Coordinator:
+    """Actor over all pairs and the critic of an assignment. Assignments are (B, N, M) float, 0 or 1."""
+
+    def __init__(self, cfg: Config, spec: Spec, rng: Generator) -> None:
+        self.cfg, self.rng = cfg, rng
+        self.gain = {"ddpg": self._slope, "counterfactual": self._difference}[cfg.coordinator]
+        encoder = ENCODERS[cfg.encoder]
+        actor = encoder.pairs(Sizes.of(spec), cfg.hidden, 1).to(rng.device)
+        critic = encoder.pairs(Sizes.of(spec, pair=1), cfg.hidden, 1).to(rng.device)
+        self.actor = Learner(actor, lr=cfg.lr, polyak=cfg.polyak, clip=cfg.grad_clip)
+        self.critic = Learner(critic, lr=cfg.lr, polyak=cfg.polyak, clip=cfg.grad_clip)
+        self.standard = Standard(cfg.standardise_h, rng.device)
+
+    def assign(self, obs: Obs, rng: Generator, *, explore: bool) -> Tensor:
+        """Assignment (B, N, M): drawn from the softened policy, or its threshold at 1/2."""
+        logits = self.actor.net(obs).squeeze(-1)
+        if explore:
+            return bernoulli(mix(logits.sigmoid(), 0.5, self.cfg.flip), rng)
+        return (logits > 0).float()
+
+    def update(self, rows: Batch) -> Batch:
+        """One step of the critic (Eq. 7) and one of the actor (Eq. 9)."""
+        obs, after = unpack(rows), unpack(rows, "next_")
+        with torch.no_grad():
+            best = (self.actor.slow(after).squeeze(-1) > 0).float()
+            live = (~rows["terminal"]).float()
+            value = self.standard.value(worth(self.critic.slow, after, best))
+            target = self.standard.reward(rows["reward"]) + self.cfg.gamma_h * live * value
+            self.standard.see_returns(target)
+        q = worth(self.critic.net, obs, rows["assignment"])
+        td = mse_loss(q, self.standard.target(target))
+        self.critic.update(td)
+        logits = self.actor.net(obs).squeeze(-1)
+        self.actor.update(-self.gain(obs, logits))
+        logs = {"high_td": td, "high_q": q.mean(), "high_logit": logits.abs().mean()}
+        logs |= {"assigned": rows["assignment"].sum((1, 2)).mean(), "earned": rows["earned"].mean()}
+        return logs | {"regulated": rows["reward"].mean()}
+
+    def _slope(self, obs: Obs, logits: Tensor) -> Tensor:
+        return worth(self.critic.net, obs, relaxed_bernoulli(logits, self.rng)).mean()
+
+    def _difference(self, obs: Obs, logits: Tensor) -> Tensor:
+        """Expected advantage of the Bernoulli chances plus entropy; advantages scaled to deviation 1."""
+        chance = logits.sigmoid()
+        with torch.no_grad():
+            advantage = differences(self.critic.net, obs, bernoulli(chance, self.rng))
+            advantage = advantage / advantage.std().clamp(min=1e-6)
+        entropy = softplus(logits) - logits * chance
+        return (chance * advantage + self.cfg.entropy * entropy).mean()
+
+    def learners(self) -> Learners:
+        """Actor and critic."""
+        return [self.actor, self.critic]
+
+    def _parts(self) -> checkpoint.Parts:
+        return {"actor": self.actor, "critic": self.critic, "standard": self.standard}
+
+    def state_dict(self) -> State:
+        """Networks and statistics; the generator belongs to its owner."""
+        return checkpoint.save_parts(self._parts())
+
+    def load_state_dict(self, state: State) -> None:
+        """Continue from `state_dict`."""
+        checkpoint.load_parts(state, self._parts())
+
+
+def worth(critic: nn.Module, obs: Obs, assignment: Tensor) -> Tensor:
+    """The critic's value of an assignment, a sum over pairs: (B, N, M) -> (B,)."""
+    return critic(append(obs, pair=assignment.unsqueeze(-1))).sum((1, 2, 3))
+
+
+def differences(critic: PairNet, obs: Obs, assignment: Tensor) -> Tensor:
+    """Q(s, g with g_ij = 1) - Q(s, g with g_ij = 0) for every pair, the other pairs as in `assignment`. (B, N, M)."""
+    told = append(obs, pair=assignment.unsqueeze(-1))
+    change = critic.flips(told) - critic(told).sum((1, 2, 3)).view(-1, 1, 1)
+    return change * (1 - 2 * assignment)

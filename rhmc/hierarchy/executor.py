@@ -1,0 +1,134 @@
+"""The low level: shared actor and central critic that act under an assignment (section 4.3, Eq. 10 to 13).
+
+The actor sees its own (filtered) row and its assignment; the critic sees everything, every assignment and the other
+agents' actions, and has one output per own action. The bootstrap keeps the assignment that was acted under, so that the
+executors' task does not change with the coordinator.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Literal
+
+import torch
+from pydantic import Field
+from torch import Generator, Tensor
+from torch.nn.functional import mse_loss, one_hot
+
+from rhmc.hierarchy.filters import FILTERS
+from rhmc.learning import checkpoint
+from rhmc.learning.learner import Learner, Learners, pack_step, taken, unpack
+from rhmc.learning.normalisation import Scale, Standard
+from rhmc.learning.settings import Slow
+from rhmc.networks.nets import ENCODERS, Sizes, append, team
+from rhmc.networks.sampling import gumbel, mix, straight_through
+from rhmc.types import Batch, Obs, Spec, State, Transition, assigned_reward
+
+
+class Config(Slow):
+    """Settings of the low level; lr and gamma are the paper's."""
+
+    filter: Literal["on", "off"] = Field("on", description="hide unassigned targets from the executors (Eq. 10)")
+    executor: Literal["gumbel", "expected", "mixed"] = Field(
+        "gumbel",
+        description="an actor with a straight-through Gumbel-softmax, or with the expectation over own actions; or no "
+        "actor: the best of own values, learned through a mixture (`rhmc.hierarchy.mixing_executor`)",
+    )
+    low_reward: Literal["local", "team"] = Field(
+        "local", description="what the executors are paid: their scores on assigned targets, or the team's reward"
+    )
+    gamma_l: float = Field(0.99, ge=0, le=1)
+    standardise_l: Scale = Field("none", description="as `standardise` of other methods, for the executors")
+    epsilon: float = Field(0.05, ge=0, le=1, description="share of actions drawn at random while exploring")
+    logit_penalty: float = Field(1e-3, ge=0, description="weight of the squared logits (as in MADDPG)")
+    batch: int = Field(256, ge=1, description="rows of an update")
+
+
+class Executor:
+    """All executors: one actor and one critic, shared parameters. Assignments are (B, N, M) float, 0 or 1."""
+
+    def __init__(self, cfg: Config, spec: Spec, rng: Generator) -> None:
+        self.cfg, self.actions = cfg, spec.actions
+        self.filter, self.paid = cfg.filter, PAID[cfg.low_reward]
+        policies = {"gumbel": partial(straight_through, rng=rng), "expected": partial(torch.softmax, dim=-1)}
+        self.policy: Callable[[Tensor], Tensor] = policies[cfg.executor]
+        encoder, sizes = ENCODERS[cfg.encoder], Sizes.of(spec, pair=1)
+        local = partial(encoder.local, sizes, cfg.hidden, spec.actions)
+        central = partial(encoder.central, sizes, cfg.hidden, spec.actions, joint=spec.actions)
+        actor, critic = (team(make, spec.agents, share=cfg.share).to(rng.device) for make in (local, central))
+        self.actor = Learner(actor, lr=cfg.lr, polyak=cfg.polyak, clip=cfg.grad_clip)
+        self.critic = Learner(critic, lr=cfg.lr, polyak=cfg.polyak, clip=cfg.grad_clip)
+        self.standard = Standard(cfg.standardise_l, rng.device)
+
+    def act(self, obs: Obs, assignment: Tensor, rng: Generator, *, explore: bool) -> Tensor:
+        """Actions (B, N) int64: sampled from the softened policy, or its greatest logit."""
+        logits = self.actor.net(seen(self.filter, obs, assignment))
+        if explore:
+            logits = mix(logits.softmax(-1), 1 / self.actions, self.cfg.epsilon).log() + gumbel(logits.shape, rng)
+        return logits.argmax(-1)
+
+    def rows(self, t: Transition, assignment: Tensor) -> Batch:
+        """One row per environment of Alg. 2's B_l."""
+        reward = self.paid(t, assignment)
+        self.standard.see_rewards(reward)
+        return pack_step(t) | {"assignment": assignment, "reward": reward}
+
+    def update(self, rows: Batch) -> Batch:
+        """One step of the critic (Eq. 11) and one of the actor (Eq. 13, ascent)."""
+        g, obs, joint = rows["assignment"], unpack(rows), self._one_hot(rows["action"])
+        q = self.critic.net(told(obs, g), joint=joint)
+        chosen = taken(q, rows["action"])
+        target = self._target(rows)
+        self.standard.see_returns(target)
+        td = mse_loss(chosen, self.standard.target(target))
+        logits = self.actor.net(seen(self.filter, obs, g))
+        gain = (q.detach() * self.policy(logits)).sum(-1).mean()
+        self.critic.update(td)
+        self.actor.update(self.cfg.logit_penalty * logits.square().mean() - gain)
+        logs = {"low_td": td, "low_q": chosen.mean(), "low_reward": rows["reward"].mean()}
+        return logs | {"low_logit": logits.abs().mean()}
+
+    @torch.no_grad()
+    def _target(self, rows: Batch) -> Tensor:
+        g, after = rows["assignment"], unpack(rows, "next_")
+        best = self.actor.slow(seen(self.filter, after, g)).argmax(-1)
+        value = self.standard.value(taken(self.critic.slow(told(after, g), joint=self._one_hot(best)), best))
+        return self.standard.reward(rows["reward"]) + self.cfg.gamma_l * (~rows["terminal"]).unsqueeze(-1) * value
+
+    def _one_hot(self, action: Tensor) -> Tensor:
+        return one_hot(action, self.actions).float()
+
+    def learners(self) -> Learners:
+        """Actor and critic."""
+        return [self.actor, self.critic]
+
+    def _parts(self) -> checkpoint.Parts:
+        return {"actor": self.actor, "critic": self.critic, "standard": self.standard}
+
+    def state_dict(self) -> State:
+        """Networks and statistics; the generator belongs to its owner."""
+        return checkpoint.save_parts(self._parts())
+
+    def load_state_dict(self, state: State) -> None:
+        """Continue from `state_dict`."""
+        checkpoint.load_parts(state, self._parts())
+
+
+def told(obs: Obs, assignment: Tensor) -> Obs:
+    """The observation with the assignment as the last feature of every pair."""
+    return append(obs, pair=assignment.unsqueeze(-1))
+
+
+def seen(name: str, obs: Obs, assignment: Tensor) -> Obs:
+    """The same as an executor gets it: behind the filter `name` (Eq. 10)."""
+    return told(obs._replace(pairs=FILTERS[name](obs.pairs, assignment)), assignment)
+
+
+def _local(t: Transition, assignment: Tensor) -> Tensor:
+    return assigned_reward(t.local, assignment)
+
+
+def _team(t: Transition, assignment: Tensor) -> Tensor:
+    return t.reward.unsqueeze(-1).expand(assignment.shape[:2])
+
+
+PAID = {"local": _local, "team": _team}

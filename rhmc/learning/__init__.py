@@ -1,0 +1,1 @@
+"""Parts that learners share: replay, returns, normalisation, optimisation, settings, checkpoints; no method."""

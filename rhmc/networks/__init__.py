@@ -1,0 +1,1 @@
+"""Networks over observations, output heads, and sampling; no losses and no optimisers."""

@@ -1,0 +1,1 @@
+"""The training loop and greedy evaluation; no log, no processes, no files."""

@@ -1,0 +1,192 @@
+"""What the pipeline declares is the same bytes wherever results are equal, and `make repro` ends by saying so."""
+
+import os
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pyarrow.parquet as pq
+import pytest
+from ruamel.yaml import YAML
+
+from pipelines.export.tables import MADE, METRICS, PLACE, RUNS, write_tables
+from pipelines.export.yardsticks import Bank, Scored, export_yardsticks
+from pipelines.policies.transfer import TRANSFER
+from pipelines.tracking.plan import items, study_card
+from pipelines.tracking.tracker import MemoryTracker
+from pipelines.workspace.provenance import Host
+from reports.pages import build
+from rhmc.envs import coverage
+from tests.pipelines.support import setting, tiny
+
+ROOT = Path(__file__).parents[3]
+STAGES: dict[str, Any] = YAML(typ="safe").load((ROOT / "dvc.yaml").read_text(encoding="utf-8"))["stages"]
+HOME = "results/${profile}/"
+PAGE = {"index.html", "index.md", "measured"}  # of the report, and no out
+
+
+def outs(stage: str) -> set[str]:
+    """Below the folder of the profile."""
+    names = {next(iter(out)) for out in STAGES[stage]["outs"]}
+    return {name.removeprefix(HOME) for name in names if name.startswith(HOME)}
+
+
+def deps(stage: str) -> set[str]:
+    return {name.removeprefix(HOME) for name in STAGES[stage].get("deps", []) if name.startswith(HOME)}
+
+
+class World(NamedTuple):
+    """Where and when the same results are made."""
+
+    commit: str
+    host: Host
+    slowness: float
+    adopted: str
+
+
+HERE = World("c0ffee", Host("one core", "Python 3.11.7, torch 2.13.0+cpu"), 1.0, "")
+THERE = World("decade-dirty", Host("two cores", "Python 3.13.0, torch 2.13.0+cu130"), 7.7, "from code 0123456789ab")
+
+
+def make(folder: Path, world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Export a study and yardsticks that are in `dvc.yaml`, and report on them."""
+    study = tiny("coverage", arms={"RHMC": setting(lr=1e-4), "IQL": setting(lr=1e-2)}).model_copy(update={"seeds": 2})
+    runs = folder / "runs"
+    tracker = MemoryTracker(study_card(study), [])
+    for n, item in enumerate(items(study, world.commit, world.host)):
+        log = tracker.start(item.card)
+        steps = range(0, item.spec.trainer.steps + 1, 200)
+        log.log([{"step": float(s), "eval/return": n + s / 9, "time/seconds": s * world.slowness} for s in steps])
+        log.log([{"step": float(steps[-1]), "final/return": n + steps[-1] / 9}])
+        log.finish("finished")
+    recorded = [run._replace(adopted=world.adopted) for run in tracker.recorded()]
+    monkeypatch.setattr(tracker, "recorded", lambda: recorded)
+    write_tables(study, items(study), tracker, runs)
+    monkeypatch.setattr("pipelines.export.yardsticks.commit", lambda: world.commit)
+    monkeypatch.setattr("pipelines.export.yardsticks.host", lambda: world.host)
+    bank = Bank(coverage.Config(agents=2, targets=2), ("best_window",), 4)
+    score = {"coverage": 40.0, "return": 40.0, "sem": 0.5}
+    export_yardsticks([Scored(bank, {"best_window": score})], "quick", runs)
+    assert build.build(runs, folder, "quick").undrawn == []
+
+
+def files(folder: Path) -> Iterator[str]:
+    return (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+
+
+def test_no_out_depends_on_commit_machine_or_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make(tmp_path / "here", HERE, monkeypatch)
+    make(tmp_path / "there", THERE, monkeypatch)
+    names = set(files(tmp_path / "here"))
+    assert names == set(files(tmp_path / "there"))
+    other = {n for n in names if (tmp_path / "here" / n).read_bytes() != (tmp_path / "there" / n).read_bytes()}
+    declared = set().union(*map(outs, STAGES))
+    assert {name for name in other if not declared.isdisjoint({name, *map(str, Path(name).parents)})} == set()
+    assert {name for name in names if declared.isdisjoint({name, *map(str, Path(name).parents)})} == other
+    assert other == {
+        *("index.html", "index.md", "runs/coverage.made.parquet", "runs/yardsticks.made.parquet"),
+        *(
+            f"measured/{name}.{kind}"
+            for name in ("made", "provenance", "time_coverage")
+            for kind in ("csv", "md", "tex")
+        ),
+    }
+    for world, folder in ((HERE, "here"), (THERE, "there")):
+        told = (tmp_path / folder / "measured" / "provenance.csv").read_text() + "".join(
+            (tmp_path / folder / "measured" / "made.csv").read_text()
+        )
+        for word in (world.commit, world.host.machine, world.host.versions, world.adopted):
+            assert word in told
+
+
+def test_the_pipeline_names_what_the_report_reads_and_writes() -> None:
+    written = set(build.MADE)
+    assert outs("report") == written - PAGE
+    assert written >= PAGE
+    assert deps("report") == set().union(*(outs(name) for name in STAGES if name != "report"))
+    every = set().union(*map(outs, STAGES), *map(deps, STAGES))
+    assert {name for name in every if name.endswith(".made.parquet") or name == "runs"} == set()
+
+
+def test_no_other_table_has_room_for_how_it_was_made() -> None:
+    own = set(MADE.names) - {name for name, _ in PLACE}
+    assert own == {"commit", "seconds", "machine", "versions", "adopted"}
+    for schema in (METRICS, RUNS, TRANSFER):
+        assert own.isdisjoint(schema.names)
+    published = list((ROOT / "results" / "paper" / "runs").glob("*.parquet"))
+    assert published
+    for file in published:
+        assert own.isdisjoint(pq.read_schema(file).names) != file.name.endswith(".made.parquet"), file
+
+
+# The last steps of `make repro`
+
+RHMC = """#!/bin/sh
+echo "$*" >> calls
+case "$1" in
+profile) echo quick ;;
+report) touch results/quick/index.html ;;
+verify) echo "the verdict"; exit "$(cat verdict)" ;;
+esac
+"""
+
+
+@pytest.fixture
+def clone(tmp_path: Path) -> Path:
+    """The makefile, with programs that only note how they were called; a profile that has run."""
+    for name in ("Makefile", "requirements.lock", "pyproject.toml"):
+        shutil.copy(ROOT / name, tmp_path)
+    tools = tmp_path / ".venv" / "bin"
+    tools.mkdir(parents=True)
+    for name, text in (("rhmc", RHMC), ("dvc", '#!/bin/sh\nexit "$(cat pipeline)"\n')):
+        (tools / name).write_text(text)
+        (tools / name).chmod(0o755)
+    (tmp_path / ".venv" / ".ready").touch()
+    (tmp_path / "pipeline").write_text("0")
+    (tmp_path / "verdict").write_text("0")
+    (tmp_path / "results" / "quick" / "runs").mkdir(parents=True)
+    return tmp_path
+
+
+class Said(NamedTuple):
+    code: int
+    last: str
+    calls: list[str]
+
+
+def repro(clone: Path) -> Said:
+    (clone / "calls").unlink(missing_ok=True)
+    env = {name: value for name, value in os.environ.items() if name not in ("MAKEFLAGS", "MFLAGS", "MAKELEVEL")}
+    done = subprocess.run(["make", "repro"], cwd=clone, env=env, capture_output=True, text=True, check=False)
+    calls = [line for line in (clone / "calls").read_text().splitlines() if line != "profile"]
+    return Said(done.returncode, done.stdout.splitlines()[-1], calls)
+
+
+def test_the_page_is_made_where_it_is_missing_or_old(clone: Path) -> None:
+    page, made = clone / "results/quick/index.html", clone / "results/quick/runs/reach.made.parquet"
+    assert repro(clone).calls == ["report --profile quick"]
+    assert page.exists()
+    made.touch()
+    for path, time in ((made, 10), (made.parent, 10), (page, 20)):
+        os.utime(path, (time, time))
+    assert repro(clone).calls == []
+    os.utime(made, (30, 30))
+    assert repro(clone).calls == ["report --profile quick"]
+
+
+@pytest.mark.parametrize(("verdict", "code"), [(0, 0), (1, 0), (2, 2)])
+def test_the_last_line_is_on_the_published_results(clone: Path, verdict: int, code: int) -> None:
+    assert repro(clone).last.startswith("MLflow UI: ")
+    (clone / "results" / "published" / "quick").mkdir(parents=True)
+    (clone / "verdict").write_text(str(verdict))
+    assert repro(clone) == (code, "the verdict", ["verify --runs results/quick/runs --profile quick"])
+
+
+def test_a_pipeline_that_stopped_is_not_verified(clone: Path) -> None:
+    (clone / "results" / "published" / "quick").mkdir(parents=True)
+    (clone / "pipeline").write_text("1")
+    said = repro(clone)
+    assert (said.code, said.calls) == (2, [])
+    assert said.last == "Not finished. What is done is kept: `make repro` continues."

@@ -1,0 +1,147 @@
+"""From a log to the three files that the reports read."""
+
+from pathlib import Path
+
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+import torch
+
+from pipelines.export.tables import MADE, METRICS, RUNS, export_study, write_tables
+from pipelines.specs.study import RunSpec
+from pipelines.tracking.plan import Item, items, study_card
+from pipelines.tracking.tracker import MemoryRun, MemoryTracker
+from pipelines.workspace.provenance import Host, host
+from pipelines.workspace.work_folder import StoreError
+from reports.data.exported import FORMS
+from tests.pipelines.support import CODE, plan, tiny
+
+POINTS = [
+    {"step": float(step), "eval/return": step / 3, "train/loss": 0.1, "time/seconds": step / 100, "time/x": 1.0}
+    for step in (0, 200, 400)
+]
+
+
+@pytest.fixture
+def shelf() -> list[MemoryRun]:
+    return []
+
+
+@pytest.fixture
+def tracker(shelf: list[MemoryRun]) -> MemoryTracker:
+    return MemoryTracker(study_card(tiny()), shelf)
+
+
+def log(tracker: MemoryTracker, item: Item, points: int = 3, status: str = "finished") -> None:
+    """Log a run."""
+    run = tracker.start(item.card)
+    run.log(POINTS[:points])
+    run.finish(status)
+
+
+def read(folder: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Values and planned runs."""
+    return pd.read_parquet(folder / "tiny.parquet"), pd.read_parquet(folder / "tiny.runs.parquet")
+
+
+def made(folder: Path) -> pd.DataFrame:
+    """How the runs were made, by arm."""
+    return pd.read_parquet(folder / "tiny.made.parquet").set_index("arm")
+
+
+def test_one_row_per_metric_and_point(tracker: MemoryTracker, tmp_path: Path) -> None:
+    runs = plan()
+    for item in reversed(runs):
+        log(tracker, item)
+    assert write_tables(tiny(), runs, tracker, tmp_path) == 0
+    values, table = read(tmp_path)
+    assert list(values) == METRICS.names == ["study", "arm", "seed", "run", "step", "metric", "value"]
+    assert list(table) == RUNS.names
+    assert pq.read_schema(tmp_path / "tiny.made.parquet").names == MADE.names
+    assert len(values) == 2 * 3 * 2
+    assert values.equals(values.sort_values(list(values)[:6], ignore_index=True))
+    slow = values[(values.arm == "slow") & (values.metric == "eval/return")]
+    assert list(zip(slow.step, slow.value, strict=True)) == [(0, 0.0), (200, 200 / 3), (400, 400 / 3)]
+    assert set(values.run) == {item.card.spec_id for item in runs}
+    assert set(values.metric) == {"eval/return", "train/loss"}
+
+
+def test_where_a_run_was_started_is_told_where_it_is_known(tracker: MemoryTracker, tmp_path: Path) -> None:
+    here, unknown = items(tiny(), "abc", Host("a machine", "torch 2"))[0], plan()[1]
+    log(tracker, here)
+    log(tracker, unknown)  # of an earlier version, or brought in from elsewhere
+    write_tables(tiny(), plan(), tracker, tmp_path)
+    told = made(tmp_path)[["machine", "versions"]]
+    assert told.loc["slow"].tolist() == ["a machine", "torch 2"]
+    assert told.loc["fast"].tolist() == ["", ""]
+    assert f"torch {torch.__version__}" in host().versions
+
+
+def test_one_row_per_planned_run(tracker: MemoryTracker, tmp_path: Path) -> None:
+    runs = plan()
+    log(tracker, runs[0])
+    assert write_tables(tiny(), runs, tracker, tmp_path) == 1
+    fast, slow = read(tmp_path)[1].to_dict("records")
+    assert (slow["arm"], slow["status"]) == ("slow", "finished")
+    assert (fast["arm"], fast["status"]) == ("fast", "missing")
+    (known,) = made(tmp_path).reset_index().to_dict("records")  # of the other there is nothing to tell
+    assert (known["arm"], known["seconds"], known["commit"]) == ("slow", 4.0, "abc-dirty")
+    assert known["run"] == slow["run"]
+    assert RunSpec.model_validate_json(slow["config"]) == runs[0].spec
+    expected = {"algorithm": "iql", "task": "coverage", "profile": "quick", "fingerprint": CODE, "seed": 0}
+    assert slow.items() >= (expected | {"question": "Does the whole chain hold?"}).items()
+
+
+def test_a_run_under_way_is_partial(tracker: MemoryTracker, tmp_path: Path) -> None:
+    runs = plan()
+    log(tracker, runs[0])
+    log(tracker, runs[1], points=1, status="interrupted")
+    assert write_tables(tiny(), runs, tracker, tmp_path) == 1
+    values, table = read(tmp_path)
+    assert list(table.status) == ["partial", "finished"]
+    assert list(values[values.arm == "fast"].step.unique()) == [0]
+
+
+def test_what_is_not_planned_or_of_other_code_stays_behind(tracker: MemoryTracker, tmp_path: Path) -> None:
+    runs = plan()
+    for item in runs:
+        log(tracker, item)
+        log(tracker, item._replace(card=item.card._replace(fingerprint="0ther")))
+        log(tracker, item._replace(card=item.card._replace(spec_id="0ther")))
+    write_tables(tiny(), runs[:1], tracker, tmp_path)
+    values, table = read(tmp_path)
+    assert len(values) == 6
+    assert len(table) == 1
+
+
+def test_the_same_log_gives_the_same_bytes(shelf: list[MemoryRun], tmp_path: Path) -> None:
+    runs = plan()
+    for folder, order in (("a", runs), ("b", runs[::-1])):
+        tracker = MemoryTracker(study_card(tiny()), [])
+        for item in order:
+            log(tracker, item)
+        write_tables(tiny(), runs, tracker, tmp_path / folder)
+        write_tables(tiny(), runs[::-1], tracker, tmp_path / folder / "again")
+    names = ("tiny.parquet", "tiny.runs.parquet", "tiny.made.parquet")
+    folders = ("a", "a/again", "b", "b/again")
+    assert all(len({(tmp_path / folder / name).read_bytes() for folder in folders}) == 1 for name in names)
+    assert sorted(path.name for path in (tmp_path / "b").iterdir() if path.is_file()) == sorted(names)
+
+
+def test_the_reports_read_what_is_exported() -> None:
+    forms = {"points": METRICS, "runs": RUNS, "made": MADE}
+    assert {name: FORMS[name] for name in forms} == {name: tuple(schema.names) for name, schema in forms.items()}
+
+
+def test_nothing_logged_yet(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert export_study(tiny(), tmp_path / "out", tmp_path / "none") == 1
+    assert "2 of 2 runs are not finished" in capsys.readouterr().err
+    values, table = read(tmp_path / "out")
+    assert (list(values), len(values)) == (METRICS.names, 0)
+    assert list(table.status) == ["missing", "missing"]
+
+
+def test_a_folder_that_cannot_be_written(tracker: MemoryTracker, tmp_path: Path) -> None:
+    (tmp_path / "out").touch()
+    with pytest.raises(StoreError, match=r"out/tiny\.parquet: cannot be written"):
+        write_tables(tiny(), plan(), tracker, tmp_path / "out")

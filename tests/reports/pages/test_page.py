@@ -1,0 +1,209 @@
+"""The report as one page: whole, readable without scripts, open about what is not there."""
+
+import re
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from reports.data.frame import TableError
+from reports.pages import page
+from reports.pages.build import build, main
+from tests.reports.factory import noisy, study, write, yardsticks
+
+pytestmark = pytest.mark.usefixtures("quick_resampling")
+VOID = {"meta", "img", "br", "link", "hr", "input"}
+
+
+class Reader(HTMLParser):
+    """Tags with their attributes, and whether they close in order."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str]]] = []
+        self.open: list[str] = []
+        self.words: list[str] = []
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, {name: value or "" for name, value in attrs}))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if not {"style", "script"} & set(self.open):
+            self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.words).split())
+
+    def of(self, tag: str) -> Iterator[dict[str, str]]:
+        return (attributes for name, attributes in self.tags if name == tag)
+
+
+@pytest.fixture(scope="module")
+def read(made: Path) -> Reader:
+    return Reader((made / "index.html").read_text())
+
+
+def test_nothing_is_fetched(made: Path, read: Reader) -> None:
+    text = re.sub(r"data:image/(png|gif);base64,[A-Za-z0-9+/=]+", "", (made / "index.html").read_text())
+    assert "http://" not in text.replace("http://www.w3.org", "")
+    assert "https://" not in text
+    assert not re.search(r"@import|url\(|<link|<script src", text)
+    kinds = {image["src"].partition(";")[0] for image in read.of("img")}
+    assert kinds == {"data:image/png", "data:image/gif"}
+
+
+def test_every_link_leads_somewhere(made: Path, read: Reader) -> None:
+    places = [attributes["id"] for _, attributes in read.tags if attributes.get("id")]
+    assert len(places) == len(set(places))
+    links = [link["href"] for link in read.of("a")]
+    assert len(links) > 20
+    assert [x for x in links if x.startswith("#") and x[1:] not in places] == []
+    assert [x for x in links if not x.startswith("#") and not (made / x).is_file()] == []
+
+
+def test_every_figure_has_words_for_those_who_do_not_see_it(made: Path, read: Reader) -> None:
+    images = list(read.of("img"))
+    assert len(images) == len(list((made / "figures").glob("*.png"))) + 1  # and an animation
+    for image in images:
+        assert len(image["alt"]) > 30
+        assert int(image["width"]) > int(image["height"]) / 3 > 0
+    for n in (1, 2, 3, 4, 5, 8, 10):
+        assert f"Fig. {n}. " in read.text
+    assert "Fig. 9" not in read.text  # no study of it
+
+
+def test_claims_come_first_with_all_that_belongs_to_them(read: Reader) -> None:
+    parts = [attributes["id"] for attributes in read.of("section")]
+    assert parts[0] == "claims"
+    assert parts[1] == "method"
+    assert parts[-4:] == ["missing", "definitions", "provenance", "runs"]
+    assert len(list(read.of("article"))) == 13
+    for words in (
+        "Without the regulation mechanism the final reward falls from 70.5 to 35.6.",
+        "70.5 to 35.6 (Table 2)",
+        "full − no regulation: 10.0 [",
+        "rhmc study run studies/ablation.yaml --profile quick && rhmc export",
+        "4 x 3 x 5: % lost: 4.0",
+        "C13",
+    ):
+        assert words in read.text
+
+
+def test_tables_sort_by_keyboard(made: Path, read: Reader) -> None:
+    heads = list(read.of("th"))
+    assert heads
+    assert all(head == {"scope": "col"} for head in heads)
+    buttons = [attributes for attributes in read.of("button") if attributes == {"type": "button"}]
+    assert len(buttons) == len(heads)
+    script = (made / "index.html").read_text().partition("<script>")[2]
+    assert "aria-sort" in script
+    assert all("data-key" in cell for cell in read.of("td"))
+
+
+def test_a_half_finished_study_says_so(made: Path, read: Reader) -> None:
+    assert "Not everything is there yet." in read.text
+    assert "Study reach, arm one <step>: 1 of 3 seeds not run (seed 0)." in read.text
+    assert "Study reach, arm one <step>: 1 of 3 seeds unfinished (seed 1)." in read.text
+    assert "Study reach (4 of 6 runs finished)" in read.text
+    assert "Study `navigation`: no results." in (made / "index.md").read_text()
+    finals = pd.read_csv(made / "tables" / "final_reach.csv").set_index("arm")
+    assert finals.loc["one <step>", "mean"] == 68.0  # the one finished seed, and no zero beside it
+    assert np.isnan(finals.loc["one <step>", "mean_low"])
+    listed = pd.read_csv(made / "tables" / "runs.csv").set_index("status")["final_return"]
+    assert np.isnan(listed["missing"])
+    assert np.isnan(listed["partial"])
+
+
+def test_what_made_the_runs(read: Reader) -> None:
+    for words in ("Code 0123456789ab", " c0ffee ", "Machine not exported", "Processor time of all runs"):
+        assert words in read.text
+    assert "not all made by the same code" not in read.text
+
+
+@pytest.mark.usefixtures("unpainted")
+def test_machine_and_versions_where_they_are_exported(tmp_path: Path) -> None:
+    points, runs = study("coverage", {"RHMC": noisy(67), "IQL": noisy(63)}, points=4)
+    told = runs.assign(machine="two cores", versions="torch 2.13.0", fingerprint=["a", "a", "b"] * 2, seconds=1800.0)
+    build(write(tmp_path, (points, told)), tmp_path / "out", "quick")
+    text = Reader((tmp_path / "out" / "index.html").read_text()).text
+    assert "Machine two cores Versions torch 2.13.0 Processor time of all runs 3 h 0 min" in text
+    assert "The runs were not all made by the same code." in text
+
+
+def test_a_page_without_how_the_runs_were_made(tmp_path: Path) -> None:
+    folder = write(tmp_path, study("coverage", {"RHMC": noisy(67), "IQL": noisy(63)}, points=4))
+    (folder / "coverage.made.parquet").unlink()
+    build(folder, tmp_path / "out", "quick")
+    text = Reader((tmp_path / "out" / "index.html").read_text()).text
+    assert "Machine not exported Versions not exported Processor time of all runs not exported" in text
+    assert "commit unknown." in (tmp_path / "out" / "index.md").read_text()
+    assert not (tmp_path / "out" / "measured" / "time_coverage.csv").exists()
+    assert pd.read_csv(tmp_path / "out" / "measured" / "made.csv")["commit"].isna().all()
+
+
+@pytest.mark.usefixtures("unpainted")
+def test_one_study(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arms = {"one": noisy(67), "two": noisy(63), "three": noisy(50)}
+    runs = write(tmp_path / "runs", study("reach", arms, points=4), study("other", {"x": noisy(1)}), yardsticks())
+    out = tmp_path / "out"
+    assert main(["--study", "reach", "--runs", str(runs), "--out", str(out)]) == 0
+    assert f"start with {out / 'index.html'}" in capsys.readouterr().out
+    names = {str(path.relative_to(out)) for path in out.rglob("*") if path.is_file()}
+    assert {"index.html", "index.md", "figures/curves_reach.pdf", "tables/pairs_reach.tex"} <= names
+    assert not [name for name in names if "other" in name or "claims" in name or "yardsticks" in name]
+    text = Reader((out / "index.html").read_text()).text
+    assert "Study reach, profile quick" in text
+    assert "Pairs of arms, study reach" in text
+    assert "The paper's claims" not in text
+    assert main(["--study", "raech", "--runs", str(runs), "--out", str(out)]) == 2
+    assert "no table of study 'raech' here (there are other, reach)" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("unpainted")
+def test_a_fault_in_another_study_does_not_stop_it(tmp_path: Path) -> None:
+    points, runs = study("other", {"x": noisy(1)}, points=4)
+    write(tmp_path, study("reach", {"one": noisy(67)}, points=4), (points.assign(value=np.nan), runs))
+    assert build(tmp_path, tmp_path / "out", "quick", "reach")
+    with pytest.raises(TableError, match="is nan"):
+        build(tmp_path, tmp_path / "all", "quick")
+
+
+@pytest.mark.parametrize(
+    ("text", "key"),
+    [
+        ("66.1 [64.0, 67.9]", "66.1"),
+        ("−25.6", "-25.6"),
+        ("+4.6 % [+3.2 %, +5.6 %]", "4.6"),
+        ("150 k", "150000"),
+        ("1.5 M", "1500000"),
+        ("10,644 (22,568)", "10644"),
+        ("< 0.001", "0.001"),
+        ("–", ""),
+        ("missing", ""),
+        ("HiT-MAC", "hit-mac"),
+        ("2 of 3", "2"),
+        ("4 x 3 x 5", "4"),
+    ],
+)
+def test_what_a_cell_is_sorted_by(text: str, key: str) -> None:
+    assert page.sort_key(text) == key
+
+
+def test_words_are_escaped_and_breaks_kept() -> None:
+    assert page.cell("a<b>\nc & d").text == "a&lt;b&gt;<br>c &amp; d"
+
+
+@pytest.mark.parametrize(("seconds", "words"), [(0, "0 s"), (89, "89 s"), (95, "2 min"), (11_530, "3 h 12 min")])
+def test_durations(seconds: float, words: str) -> None:
+    assert page.duration(seconds) == words

@@ -1,0 +1,22 @@
+"""What the README shows is what the report wrote."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[3]
+README = (ROOT / "README.md").read_text()
+RESULTS = re.compile(r"^\| Arm \|.*\n(?:\|.*\n)+", re.MULTILINE)
+
+
+def test_its_tables_are_tables_of_the_report() -> None:
+    written = {path.read_text().strip() for path in (ROOT / "results" / "paper" / "tables").glob("final_*.md")}
+    shown = [found.strip() for found in RESULTS.findall(README)]
+    assert len(shown) >= 2
+    assert [table.splitlines()[2] for table in shown if table not in written] == []
+
+
+@pytest.mark.parametrize("target", re.findall(r"\]\(([^)#]+)\)", README))
+def test_its_pictures_and_links_are_there(target: str) -> None:
+    assert (ROOT / target).exists()

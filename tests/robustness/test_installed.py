@@ -1,0 +1,81 @@
+"""Installed from a wheel, outside a checkout, in a folder that has names of this project: what most users have."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.reports.factory import noisy, study, write
+
+ROOT = Path(__file__).parents[2]
+PARTS = ("rhmc", "pipelines", "reports", "studies", "rhmc_command.py", "pyproject.toml", "README.md", "LICENSE")
+TINY = """\
+question: Tiny?
+base:
+  env: {kind: coverage, agents: 2, targets: 3}
+  algo: {kind: iql}
+  trainer: {num_envs: 4, evaluations: 1, eval_episodes: 2, final_episodes: 2}
+arms: {a: {}}
+seeds: 1
+steps: 2400
+resources: {concurrent: 1}
+"""
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that the built wheel is installed in."""
+    folder = tmp_path_factory.mktemp("installed")
+    source, wheels, found = (folder / name for name in ("source", "wheels", "site"))
+    source.mkdir()
+    for part in PARTS:
+        subprocess.run(["cp", "-R", "-P", ROOT / part, source], check=True)
+    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
+    subprocess.run([*pip, "wheel", "--no-deps", "--no-build-isolation", "-w", wheels, source], check=True)
+    subprocess.run([*pip, "install", "--no-deps", "--target", found, *wheels.iterdir()], check=True)
+    return found
+
+
+@pytest.fixture
+def user(tmp_path: Path) -> Path:
+    """A person's folder, with packages of theirs."""
+    for name in ("pipelines", "reports", "rhmc"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text(f"raise RuntimeError('the {name} of a person')\n")
+    return tmp_path
+
+
+def rhmc(site: Path, user: Path, *words: str) -> str:
+    """What the installed command prints, in the person's folder and with it on the search path; it must succeed."""
+    environment = {"PYTHONPATH": f"{user}{os.pathsep}{site}", "RHMC_HOME": str(user / "work")}
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", str(site / "bin" / "rhmc"), *words],
+        cwd=user,
+        env=os.environ | environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_a_study_of_the_package_is_copied_and_checked(site: Path, user: Path) -> None:
+    assert rhmc(site, user, "study", "copy", "searched").splitlines()[0] == "studies/searched.yaml"
+    assert "searched (quick): " in rhmc(site, user, "study", "check", "studies/searched.yaml")
+
+
+def test_a_report_has_its_template_and_the_statements_of_the_paper(site: Path, user: Path) -> None:
+    write(user / "runs", study("reach", {"one": noisy(60), "two": noisy(61)}, points=3))
+    rhmc(site, user, "report", "--runs", "runs", "--out", "out")
+    assert "</html>" in (user / "out" / "index.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.ray
+def test_a_study_is_trained_beside_packages_of_a_person(site: Path, user: Path) -> None:
+    (user / "tiny.yaml").write_text(TINY)
+    assert "finished, return" in rhmc(site, user, "study", "run", "tiny.yaml")
+    rhmc(site, user, "export", "tiny.yaml", "--out", "tables")  # which fails while a run is missing
+    assert (user / "tables" / "tiny.parquet").is_file()
