@@ -16,6 +16,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from ruamel.yaml import YAML
 
+from pipelines.specs.include import closure
 from pipelines.specs.study import Study
 from rhmc.algorithms import ALGORITHMS
 from tests.conftest import LONGEST
@@ -508,6 +509,17 @@ def test_every_study_is_in_the_pipeline(stages: dict) -> None:
     tables = {f"results/${{profile}}/runs/{name}{kind}.parquet" for name in studies for kind in ("", ".runs")}
     assert unmatched("dvc.yaml", tables, [next(iter(out)) for out in stage["outs"]]) == []
     assert "studies" in stage["deps"]  # the whole folder, and with it what a study includes
+
+
+def test_a_stage_that_depends_on_a_study_depends_on_what_it_includes(stages: dict) -> None:
+    """Through the folder of all studies, or file by file."""
+    named = 0
+    for stage in (stage for name, stage in stages.items() if name != "vars"):
+        studies = [dep for dep in stage.get("deps", ()) if dep.startswith("studies/")]
+        files = {path.relative_to(ROOT).as_posix() for study in studies for path in closure(ROOT / study)}
+        assert unmatched("dvc.yaml", files, studies) == []
+        named += len(files)
+    assert named > 1
 
 
 QUICK = 5_200_000  # environment steps: some ten minutes of two processors

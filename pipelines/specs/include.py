@@ -1,19 +1,25 @@
-"""`include` in a section of a study: the section starts from that of another file, such as the winner of a search.
+"""`include` in a section of a study: the section starts from that of another file, such as settings that are tuned.
 
-    arms:
-      RHMC: {algo: {include: found/search_rhmc.rhmc.paper.yaml, horizon: 2}}
+    base:
+      env: {include: settings/coverage}
+      algo: {include: settings/coverage/rhmc, horizon: 2}
 
-The path is relative to the folder of the file that includes. What stands beside `include` goes before what is included.
-Every value keeps the place where it was written, so that a fault points into the included file.
+The path is relative to the file that includes, else to the study, else to `studies/` where the command is called, else
+to the studies of this package. It may leave out `.yaml`. An included file may include others. What stands beside
+`include` goes before what is included. Every value keeps the place where it was written: a fault points into its file.
 """
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
-from pipelines.specs.document import Fault, Node, join, merge, nearest, read, show
+from pipelines.specs.document import Fault, Node, merge, nearest, read, show
 from pipelines.workspace.files import ABSENT, fault_of
 
-KEY = "include"
+KEY, SUFFIX = "include", ".yaml"
+PROJECT = Path("studies")
+DEPTHS = ("*/*.yaml", "*/*/*.yaml")  # where files to be included lie, from a folder of studies
+SHIPPED = Path(__file__).parents[1] / "studies"  # a link to `studies/`, and a folder in a wheel
 
 
 def included(root: Node, folder: Path, sections: Sequence[str]) -> tuple[Node, list[Fault]]:
@@ -21,7 +27,7 @@ def included(root: Node, folder: Path, sections: Sequence[str]) -> tuple[Node, l
 
     Args:
         root: the file, or an override as a tree of the same shape.
-        folder: where paths start.
+        folder: that of the study.
         sections: the parts of a layer that may include.
     """
     faults: list[Fault] = []
@@ -29,9 +35,44 @@ def included(root: Node, folder: Path, sections: Sequence[str]) -> tuple[Node, l
         for section in sections:
             node = _at(root, (*way, section))
             if node is not None and KEY in node.children:
-                whole, found = _resolve(node, folder, section)
+                whole, found = _resolve(node, section, _Way(folder))
                 root, faults = _replaced(root, (*way, section), whole), faults + found
     return root, faults
+
+
+def closure(study: Path) -> list[Path]:
+    """The file of a study, then all that it includes, directly or not. What cannot be read is left out."""
+    found: dict[Path, Path] = {}  # by what it is, as one file may be named in several ways
+    waiting = [study]
+    while waiting:
+        file = waiting.pop(0)
+        if not fault_of(file) and found.setdefault(file.resolve(), file) is file:
+            root, _ = read(file)
+            way = _Way(study.parent, (file,))
+            waiting += [way.file(link.value) for link in _links(root) if isinstance(link.value, str)]
+    return list(found.values())
+
+
+class _Way(NamedTuple):
+    """From a study to the file that is read: each includes the next."""
+
+    study: Path  # its folder
+    files: tuple[Path, ...] = ()
+
+    def file(self, name: str) -> Path:
+        """What a name stands for here; where there is no such file, the first place that it was looked for."""
+        found = [folder / (name if name.endswith(SUFFIX) else name + SUFFIX) for folder in self.folders()]
+        return next((path for path in found if fault_of(path) != ABSENT), found[0])
+
+    def folders(self) -> list[Path]:
+        """Where names start, in this order."""
+        return list(dict.fromkeys([*(file.parent for file in self.files[-1:]), self.study, PROJECT, SHIPPED]))
+
+
+def _links(node: Node | None) -> Iterator[Node]:
+    """Every `include` in a tree."""
+    for key, child in (node.children if node else {}).items():
+        yield from [child] if key == KEY else _links(child)
 
 
 def _layers(root: Node) -> Iterator[tuple[str, ...]]:
@@ -57,29 +98,25 @@ def _replaced(root: Node, way: Sequence[str], node: Node) -> Node:
     return root._replace(value=root.children | {way[0]: inner})
 
 
-def _resolve(node: Node, folder: Path, section: str) -> tuple[Node, list[Fault]]:
+def _resolve(node: Node, section: str, way: _Way) -> tuple[Node, list[Fault]]:
     """The included section under what stands beside `include`; without it where that cannot be had."""
     link = node.children[KEY]
     beside = node._replace(value={key: child for key, child in node.children.items() if key != KEY})
-    source, faults = _source(link, folder, section)
+    source, faults = _source(link, section, way)
     if source is None:
         return beside, faults
     kinds = [part.children["kind"] for part in (source, beside) if "kind" in part.children]
     if len(kinds) == 2 and kinds[0].value != kinds[1].value:
         text = f"{show(kinds[1].value)} is not allowed; what is included here is of kind {show(kinds[0].value)}"
-        return beside, [Fault(kinds[1].place, kinds[1].path, text)]
-    return node._replace(value=merge(source, beside).children), []
+        return beside, [*faults, Fault(kinds[1].place, kinds[1].path, text)]
+    return node._replace(value=merge(source, beside).children), faults
 
 
-def _source(link: Node, folder: Path, section: str) -> tuple[Node | None, list[Fault]]:
-    if not isinstance(link.value, str):
-        return None, [Fault(link.place, link.path, f"{show(link.value)} is not allowed; must be the path of a file")]
-    path = folder / link.value
-    if (fault := fault_of(path)) == ABSENT:
-        near = [p.relative_to(folder).as_posix() for p in sorted(folder.glob("*/*.yaml"))]
-        return None, [Fault(link.place, link.path, f"{path}: {fault}{nearest(link.value, near)}")]
-    if fault:
-        return None, [Fault(link.place, link.path, f"{path}: {fault}")]
+def _source(link: Node, section: str, way: _Way) -> tuple[Node | None, list[Fault]]:
+    """The section of the file that a link names, with all that this includes in turn."""
+    path, faults = _named(link, way)
+    if path is None:
+        return None, faults
     root, faults = read(path)
     if root is None or faults:
         return None, faults or [_empty(link, path, section)]
@@ -87,10 +124,25 @@ def _source(link: Node, folder: Path, section: str) -> tuple[Node | None, list[F
     if found is None or not isinstance(found.value, dict):
         text = f"{path} has no mapping '{section}'; it has: {', '.join(root.children) or 'nothing'}"
         return None, [Fault(link.place, link.path, text)]
-    if KEY in found.children:
-        again = found.children[KEY]
-        return None, [Fault(again.key, join(section, KEY), "an included file may not include another; write it out")]
-    return found, []
+    return _resolve(found, section, way._replace(files=(*way.files, path))) if KEY in found.children else (found, [])
+
+
+def _named(link: Node, way: _Way) -> tuple[Path | None, list[Fault]]:
+    """The file that a link names, if it can be read."""
+    if not isinstance(link.value, str):
+        return None, [Fault(link.place, link.path, f"{show(link.value)} is not allowed; must be the path of a file")]
+    path = way.file(link.value)
+    if (fault := fault_of(path)) == ABSENT:
+        fault += nearest(link.value, _offered(way, link.value))
+    elif not fault and any(path.samefile(file) for file in way.files):
+        fault = f"includes itself, by way of {way.files[-1]}"
+    return (None, [Fault(link.place, link.path, f"{path}: {fault}")]) if fault else (path, [])
+
+
+def _offered(way: _Way, name: str) -> list[str]:
+    """What there is to include, spelled as the name is: with `.yaml` or without."""
+    files = [p.relative_to(folder) for folder in way.folders() for at in DEPTHS for p in sorted(folder.glob(at))]
+    return [(file if name.endswith(SUFFIX) else file.with_suffix("")).as_posix() for file in files]
 
 
 def _empty(link: Node, path: Path, section: str) -> Fault:

@@ -26,6 +26,7 @@ from pydantic import Field, model_validator
 
 from pipelines.specs.document import Fault, Node, Place, choices, show, validate
 from pipelines.specs.identity import code_id
+from pipelines.specs.include import closure
 from pipelines.specs.safe_names import study_name
 from pipelines.specs.study import (
     TABLES,
@@ -155,6 +156,12 @@ class Arm(NamedTuple):
             {"env": self.setting.env, "trainer": self.setting.trainer, "algo": self.setting.algo.model_dump() | params}
         )
 
+    def fixed(self) -> str:
+        """The setting as `Setting.stated` has it, without what the space replaces: equal where all trials are."""
+        stated = json.loads(self.setting.stated())
+        stated["algo"] = {name: value for name, value in stated["algo"].items() if name not in self.space}
+        return json.dumps(stated, sort_keys=True, separators=(",", ":"))
+
 
 class Search(Frozen):
     """A search resolved for one profile."""
@@ -170,7 +177,7 @@ class Search(Frozen):
     pruner: Pruner
     resources: Resources
     file: str
-    sha256: str  # of the file
+    sha256: str  # of the file, and of what it includes
     overrides: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()  # as a study's
 
@@ -193,7 +200,7 @@ class Search(Frozen):
         parts = {name: getattr(file, name) for name in ("sampler", "pruner", "resources")}
         names = {"name": study_name(path), "profile": profile, "file": str(path)}
         told = {"overrides": tuple(overrides), "remarks": tuple(map(str, dict.fromkeys(loaded.wanted.remarks)))}
-        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+        digest = hashlib.sha256(b"".join(file.read_bytes() for file in closure(path))).hexdigest()
         return cls(question=file.question.strip(), arms=arms, sha256=digest, **names, **told, **counts, **parts)
 
     def seed_list(self) -> list[int]:
@@ -211,7 +218,7 @@ class Search(Frozen):
         More trials continue a search, anything else begins another.
         """
         one = self.arms[arm]
-        parts = [one.setting.stated(), *(f"{k}={v.model_dump_json()}" for k, v in sorted(one.space.items()))]
+        parts = [one.fixed(), *(f"{k}={v.model_dump_json()}" for k, v in sorted(one.space.items()))]
         parts += [self.sampler.model_dump_json(), self.pruner.model_dump_json(), str(self.seeds), self.code(arm)]
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:12]
 

@@ -1,13 +1,11 @@
 """The studies that this package brings along: `pipelines/studies` is a link to `studies/`, and a folder in a wheel."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 from pipelines.specs.document import choices
+from pipelines.specs.include import SHIPPED, closure
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.work_folder import whole
-
-SHIPPED = Path(__file__).parents[1] / "studies"
 
 
 def names() -> list[str]:
@@ -24,7 +22,7 @@ def copy(name: str, out: Path) -> list[Path]:
     """
     if name not in names():
         raise InputError(f"'{name}' is no study of this package; {choices(name, names())}")
-    wanted = {out / path.relative_to(SHIPPED): path.read_bytes() for path in _files(name)}
+    wanted = {out / path.relative_to(SHIPPED): path.read_bytes() for path in closure(SHIPPED / f"{name}.yaml")}
     for path, text in wanted.items():
         if path.exists() and (not path.is_file() or path.read_bytes() != text):
             raise InputError(f"{path}: something else is there; move it away, or name another folder with --out")
@@ -33,11 +31,3 @@ def copy(name: str, out: Path) -> list[Path]:
             with whole(path) as part:
                 part.write_bytes(text)
     return list(wanted)
-
-
-def _files(name: str) -> Iterator[Path]:
-    """The study, then what it includes, which lies in folders beside it."""
-    study = SHIPPED / f"{name}.yaml"
-    yield study
-    text = study.read_text(encoding="utf-8")
-    yield from (path for path in sorted(SHIPPED.glob("*/**/*.yaml")) if path.relative_to(SHIPPED).as_posix() in text)

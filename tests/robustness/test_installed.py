@@ -67,6 +67,15 @@ def test_a_study_of_the_package_is_copied_and_checked(site: Path, user: Path) ->
     assert "searched (quick): " in rhmc(site, user, "study", "check", "studies/searched.yaml")
 
 
+def test_a_study_of_ones_own_includes_the_settings_of_the_package(site: Path, user: Path) -> None:
+    settings = "env: {include: settings/navigation}, algo: {include: settings/navigation/rhmc}"
+    (user / "own.yaml").write_text(
+        f"question: Own?\nbase: {{{settings}}}\narms: {{a: {{}}}}\nseeds: 1\nsteps: 45_000\n"
+    )
+    assert "own (quick): Own?" in rhmc(site, user, "study", "check", "own.yaml")
+    assert not (user / "studies").exists()
+
+
 def test_a_report_has_its_template_and_the_statements_of_the_paper(site: Path, user: Path) -> None:
     write(user / "runs", study("reach", {"one": noisy(60), "two": noisy(61)}, points=3))
     rhmc(site, user, "report", "--runs", "runs", "--out", "out")

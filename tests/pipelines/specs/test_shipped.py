@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.specs.shipped import SHIPPED, copy, names
+from pipelines.specs.include import SHIPPED
+from pipelines.specs.shipped import copy, names
 from pipelines.specs.study import Study
 from pipelines.workspace.errors import InputError
 
@@ -28,7 +29,15 @@ def test_what_a_study_includes_comes_with_it_and_nothing_else(tmp_path: Path) ->
     found = {path.relative_to(tmp_path).as_posix() for path in copy("searched", tmp_path)}
     assert found == {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.yaml")}
     assert {"searched.yaml", "found/search_rhmc.rhmc.quick.yaml"} <= found
-    assert [path.name for path in copy("coverage", tmp_path / "other")] == ["coverage.yaml"]
+    other = {path.relative_to(tmp_path / "other").as_posix() for path in copy("steadiness", tmp_path / "other")}
+    assert other == {"steadiness.yaml", "settings/coverage.yaml", "settings/coverage/rhmc.yaml"}
+
+
+def test_a_copied_study_takes_what_was_copied_with_it(tmp_path: Path) -> None:
+    file, *others = copy("navigation", tmp_path / "mine")
+    (tuned,) = [path for path in others if path.parts[-2:] == ("coverage", "rhmc.yaml")]
+    tuned.write_text(tuned.read_text(encoding="utf-8") + "  flip: 0.25\n", encoding="utf-8")
+    assert Study.load(file).arms["RHMC"].algo.flip == 0.25
 
 
 def test_a_file_that_is_there_is_left_alone(tmp_path: Path) -> None:
@@ -38,8 +47,8 @@ def test_a_file_that_is_there_is_left_alone(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=f"^{mine}: something else is there; move it away, or name another folder"):
         copy("searched", tmp_path)
     assert list(tmp_path.rglob("*.yaml")) == [mine]
-    copy("coverage", tmp_path)
-    assert copy("coverage", tmp_path) == [tmp_path / "coverage.yaml"]
+    copied = copy("coverage", tmp_path)
+    assert copy("coverage", tmp_path) == copied
 
 
 def test_a_name_that_is_no_study_has_a_suggestion(tmp_path: Path) -> None:

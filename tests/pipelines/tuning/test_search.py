@@ -1,5 +1,6 @@
 """Searches: what a file may say, that every method gets the same budget, and that a kill changes nothing."""
 
+import hashlib
 import itertools
 import math
 import os
@@ -135,6 +136,23 @@ def test_more_trials_continue_a_search_and_anything_else_begins_another() -> Non
         ("num_envs: 8", "num_envs: 4"),
     ]:
         assert identity(changed(old, new)) != first, new
+
+
+def test_what_the_space_replaces_is_no_part_of_a_searchs_identity() -> None:
+    first = load()
+    assert "lr" in first.arms["IQL"].space
+    other = load(changed("algo: {kind: iql,", "algo: {kind: iql, lr: 9e-3,"))
+    assert other.arms["IQL"].setting != first.arms["IQL"].setting
+    assert other.identity("IQL") == first.identity("IQL")
+
+
+def test_the_digest_of_a_search_covers_what_it_includes() -> None:
+    text, tuned = changed("algo: {kind: vdn,", "algo: {include: found/vdn,"), Path("studies/found/vdn.yaml")
+    tuned.write_text("algo: {kind: vdn}\n")
+    first = load(text).sha256
+    tuned.write_text("algo: {kind: vdn} # again\n")
+    assert load(text).sha256 != first
+    assert load().sha256 == hashlib.sha256(Path("studies/search_x.yaml").read_bytes()).hexdigest()
 
 
 LR = "lr: {low: 1e-4, high: 1e-2, log: true}\n      gamma"
