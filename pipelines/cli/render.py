@@ -11,7 +11,7 @@ from pipelines.specs.limits import SEED
 if TYPE_CHECKING:
     from pipelines.tracking.policy import Saved
 
-STUDY = ".yaml"
+SUFFIX = ".yaml"
 WHAT = (
     "A finished run, by its id in MLflow; or policy.pt, a checkpoint, or a folder with one; or a study, of which the "
     "first run that --arm and --seed leave is drawn."
@@ -40,7 +40,7 @@ def render(
 
     if out.suffix.lower() != ".gif":
         raise InputError(f"--out: {out} must end in .gif")
-    saved = _of_study(Path(what), profile, variant, arm, seed) if what.endswith(STUDY) else None
+    saved = _of_study(Path(what), profile, variant, arm, seed) if what.endswith(SUFFIX) else None
     tell(f"wrote {draw(saved or what, out, Home(work_folder()), episode, beside, frames)}")
 
 

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
 from pipelines.cli import main as cli
-from pipelines.specs.safe_names import PROFILES, RESERVED, STUDY, folded, slug
+from pipelines.specs.safe_names import PROFILES, RESERVED, STUDY, folded, simple, slug
 from pipelines.specs.search import Search
 from pipelines.specs.source_file import another, remember
 from pipelines.specs.study import Study, StudyError
@@ -181,7 +181,7 @@ def test_all_that_the_program_writes_beside_the_tables_is_reserved() -> None:
     made = {Path(out).name.partition(".")[0] for out in outs if "/runs/" in out and not out.endswith(".gif")}
     studies = {file.stem for file in (ROOT / "studies").glob("*.yaml")}
     assert made - studies == set(RESERVED)
-    files = [file for file in (ROOT / "pipelines").glob("*.py") if not file.name.startswith("bundle")]
+    files = [file for file in (ROOT / "pipelines").rglob("*.py") if "bundles" not in file.parts]
     found = {name for file in files for name in tables_in(file)}
     assert found == set(RESERVED)
 
@@ -346,7 +346,7 @@ PLACES = {
 @settings(max_examples=25, deadline=None, derandomize=True)
 @given(text=hostile)
 def test_whatever_is_typed_is_shown_as_what_it_is(place: str, text: str) -> None:
-    assume("/" not in text)
+    assume("/" not in text and not simple(text))
     said = rhmc(*PLACES[place](text))
     assert "Traceback" not in said.err
     assert (said.code, bool(said.err)) == (2, True)
