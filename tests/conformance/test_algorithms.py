@@ -517,7 +517,7 @@ def transition(env: Env, obs: Obs, algo: Any, **changes: Any) -> Transition:
     action, _, extra = algo.act(obs, algo.carry(env.batch), seeded(), explore=True)
     options = env.options()
     s = env.step(action, extra.get("assignment"))
-    t = Transition(obs, action, s.reward, s.local, s.completed, s.terminal, s.truncated, s.final_obs, options, extra)
+    t = Transition(obs, action, s.reward, s.local, s.completed, s.terminated, s.truncated, s.final_obs, options, extra)
     return t._replace(**changes)
 
 
@@ -553,7 +553,7 @@ def test_targets_carry_no_gradient(case: Case) -> None:
 
 def slow_parameters(algo: Any) -> list[Tensor]:
     """Of the copies that targets come from; those of a learner that never follow are none."""
-    found = [p for learner in learners(algo) for p in learner.slow.parameters()]
+    found = [p for learner in learners(algo) for p in learner.target_net.parameters()]
     assert found
     return found
 
@@ -598,7 +598,7 @@ def test_no_loss_has_a_gradient_into_what_is_observed_afterwards(case: Case, mon
 
 @one_step
 def test_truncation_bootstraps_and_termination_does_not(case: Case) -> None:
-    going, cut, over = (learn(case, **flags)[0].values for flags in ({}, {"truncated": FLAG}, {"terminal": FLAG}))
+    going, cut, over = (learn(case, **flags)[0].values for flags in ({}, {"truncated": FLAG}, {"terminated": FLAG}))
     assert all(torch.equal(a, b) for a, b in zip(going, cut, strict=True))
     assert not any(torch.equal(a, b) for a, b in zip(going, over, strict=True))
 
@@ -608,7 +608,7 @@ def test_a_terminal_row_is_worth_its_reward(case: Case) -> None:
     """So the targets of a last step do not depend on what is observed after it; others do."""
     _, obs = world(case.env, batch=1)
     elsewhere = obs._replace(pairs=obs.pairs + 1)
-    for flags, equal in (({"terminal": FLAG}, True), ({"truncated": FLAG}, False), ({}, False)):
+    for flags, equal in (({"terminated": FLAG}, True), ({"truncated": FLAG}, False), ({}, False)):
         here, there = (learn(case, **flags, next_obs=after)[0].values for after in (obs, elsewhere))
         assert [torch.equal(a, b) for a, b in zip(here, there, strict=True)] == [equal] * len(here)
 
@@ -620,7 +620,7 @@ ON_POLICY = {
 }
 
 
-@pytest.mark.parametrize("flag", ["terminal", "truncated", None])
+@pytest.mark.parametrize("flag", ["terminated", "truncated", None])
 @pytest.mark.parametrize("case", ON_POLICY.values(), ids=ON_POLICY)
 def test_a_sequence_stops_where_an_episode_ends(case: Case, flag: str | None) -> None:
     """What happens in the next episode is nothing to the step before; within an episode it is."""
@@ -756,12 +756,12 @@ def unshared(algo: Any) -> list[Unshared]:
 @pytest.mark.parametrize("kind", ALGORITHMS)
 def test_a_time_limit_that_ends_is_terminal_to_every_method(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     final = []
-    for limit, over in (("bootstrap", False), ("terminal", True)):
+    for limit, over in (("bootstrap", False), ("terminated", True)):
         run = Trainer(TASKS["navigation"], settle(kind), RUN.model_copy(update={"time_limit": limit}), seed=0)
         met, observe = [], run.algorithm.observe
         monkeypatch.setattr(run.algorithm, "observe", lambda t, met=met, observe=observe: (met.append(t), observe(t)))
         list(run)
         assert [bool(t.truncated.all()) for t in met] == [k % EPISODE == EPISODE - 1 for k in range(11)]
-        assert all(torch.equal(t.terminal, t.truncated & over) for t in met)
+        assert all(torch.equal(t.terminated, t.truncated & over) for t in met)
         final.append(torch.cat([p.flatten() for learner in learners(run.algorithm) for p in learner.params]))
     assert not torch.equal(*final)

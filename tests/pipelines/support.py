@@ -25,10 +25,17 @@ def setting(**algo: Any) -> Setting:
     return Setting.model_validate(
         {
             "env": {"kind": "coverage", "preset": "flat", "agents": 2, "targets": 2},
-            "algo": {"kind": "iql", "warmup": 64, "batch": 32, "steps_per_update": 16, "hidden": 16, "buffer": 400},
+            "algo": {
+                "kind": "iql",
+                "learning_starts": 64,
+                "batch_size": 32,
+                "train_freq": 16,
+                "hidden_dim": 16,
+                "buffer_size": 400,
+            },
             "trainer": {"steps": 600, "num_envs": 8, "evaluations": 3, "eval_episodes": 4, "final_episodes": 8},
         }
-        | ({"algo": {"kind": "iql", "warmup": 64, "batch": 32, **algo}} if algo else {})
+        | ({"algo": {"kind": "iql", "learning_starts": 64, "batch_size": 32, **algo}} if algo else {})
     )
 
 

@@ -339,8 +339,8 @@ def test_statistics_that_are_not_finite_are_not_kept(start: Start, tmp_path: Pat
     run.step()
     trainer = run.trainer
     assert isinstance(trainer, Trainer)
-    trainer.algorithm.standard.sums[2] = math.inf  # type: ignore[attr-defined]
-    with pytest.raises(DivergedError, match=r"^diverged: algorithm\.standard\.sums is inf at step 0; "):
+    trainer.algorithm.standardiser.sums[2] = math.inf  # type: ignore[attr-defined]
+    with pytest.raises(DivergedError, match=r"^diverged: algorithm\.standardiser\.sums is inf at step 0; "):
         run._save(trainer)
     assert not (tmp_path / "a" / "run0").exists()
 
@@ -381,7 +381,7 @@ def test_every_method_is_finite_at_every_point_and_each_of_its_networks_is_looke
     for point in trainer:
         check(defined(point), trainer.state_dict())
     for learner in trainer.algorithm.learners():
-        for part in (learner.net, learner.slow):
+        for part in (learner.net, learner.target_net):
             for weight in part.parameters():
                 before = weight.detach().clone()
                 weight.data.view(-1)[-1] = math.nan

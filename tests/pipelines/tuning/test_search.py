@@ -646,7 +646,7 @@ def test_the_winner_says_where_it_comes_from_and_a_study_includes_it(tmp_path: P
     )
     arms = Study.load("studies/use.yaml").arms
     assert arms["found"].algo == search.arms["IQL"].at(best.params).algo
-    assert (arms["more"].algo.lr, arms["more"].algo.hidden) == (best.params["lr"], 32)
+    assert (arms["more"].algo.lr, arms["more"].algo.hidden_dim) == (best.params["lr"], 32)
     assert (arms["VDN"].algo.kind, arms["VDN"].algo.gamma) == ("vdn", 0.5)
 
 

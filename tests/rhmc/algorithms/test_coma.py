@@ -93,7 +93,7 @@ def transition(
 def whole(algo: COMA, *steps: Transition) -> Batch:
     for t in steps:
         algo.observe(t)
-    rollout = algo.rollout.take()
+    rollout = algo.n_steps.take()
     assert rollout is not None
     return rollout
 
@@ -127,7 +127,7 @@ def judged(algo: COMA, policy: list[float], q: list[float], *steps: Transition) 
     """Returns and advantages of a rollout acted by one policy and judged by one critic, whatever is seen."""
     constant(algo.actor.net, [0.0, 0.0, 0.0])  # what the policy has become since does not count along the rollout
     constant(algo.critic.net, [77.0, 33.0, 11.0])  # nor does the critic that learns
-    constant(algo.critic.slow, q)
+    constant(algo.critic.target_net, q)
     chance = torch.tensor(policy).expand(len(steps[0].reward), N, ACTIONS)
     return algo._judged(whole(algo, *(t._replace(extra={"chance": chance}) for t in steps)))
 
@@ -197,7 +197,7 @@ def test_an_agents_action_values_see_the_others_actions_and_not_its_own(encoder:
 def test_targets_by_hand(encoder: str, middle: str, want: list[float]) -> None:
     algo = method(encoder=encoder, rollout=3)
     constant(algo.actor.net, [0.0, 0.0, -1e9])
-    constant(algo.critic.slow, [4.0, 8.0, 500.0])
+    constant(algo.critic.target_net, [4.0, 8.0, 500.0])
     constant(algo.critic.net, [77.0, 77.0, 77.0])
     steps = [transition(algo, [[0, 1]], r, after) for r, after in ((1.0, "going"), (2.0, middle), (4.0, "going"))]
     assert algo._judged(whole(algo, *steps))[0][:, 0].tolist() == [[x, x] for x in want]
@@ -216,7 +216,7 @@ def test_others_next_actions_are_those_taken_but_the_policys_where_nothing_was_t
 ) -> None:
     algo = method(rollout=2, lam=0.0)
     constant(algo.actor.net, [-1e9, -1e9, 0.0])
-    others_action(algo.critic.slow, 1.0)
+    others_action(algo.critic.target_net, 1.0)
     steps = (transition(algo, [[2, 2]], after=first), transition(algo, [[1, 0]]))
     assert algo._judged(whole(algo, *steps))[0][:, 0].tolist() == want
 
@@ -234,11 +234,11 @@ def test_standardised_rewards_make_the_scale_of_the_task_irrelevant() -> None:
 
 def test_standardised_returns_give_the_critics_outputs_their_scale() -> None:
     algo = method(rollout=1, standardise="return")
-    algo.standard.sums = torch.tensor([1.0, 10.0, 104.0])  # mean 10, deviation 2
-    constant(algo.critic.slow, [6.0, 6.0, 6.0])
+    algo.standardiser.sums = torch.tensor([1.0, 10.0, 104.0])  # mean 10, deviation 2
+    constant(algo.critic.target_net, [6.0, 6.0, 6.0])
     target, _ = algo._judged(whole(algo, transition(algo, [[0, 1]], 4.0)))
     assert target.flatten().tolist() == pytest.approx([15.0, 15.0])  # 4 + (6 * 2 + 10)/2
-    assert algo.standard.target(target).flatten().tolist() == pytest.approx([2.5, 2.5])
+    assert algo.standardiser.target(target).flatten().tolist() == pytest.approx([2.5, 2.5])
 
 
 def test_what_the_critic_learns_is_standardised_by_the_returns_seen(monkeypatch: pytest.MonkeyPatch) -> None:

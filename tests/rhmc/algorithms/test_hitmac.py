@@ -173,11 +173,13 @@ def test_assignments_are_drawn_with_the_chances_that_are_said() -> None:
 # Decisions
 
 
-def step(obs: Obs, extra: Batch, reward: float, after: Obs, *, terminal: bool = False, truncated: bool = False) -> Any:
+def step(
+    obs: Obs, extra: Batch, reward: float, after: Obs, *, terminated: bool = False, truncated: bool = False
+) -> Any:
     """A transition of all environments alike."""
     b = len(obs.pairs)
     local = Local(torch.zeros(b, N, M), torch.zeros(b, N))
-    flags = torch.full((b,), terminal), torch.full((b,), truncated)
+    flags = torch.full((b,), terminated), torch.full((b,), truncated)
     done, action = torch.zeros(b, N, M).bool(), torch.zeros(b, N, dtype=torch.int64)
 
     def options(horizon: int) -> Tensor:
@@ -212,22 +214,22 @@ def test_a_decision_is_paid_the_mean_of_its_steps_and_a_cut_one_for_those_it_had
     assert rows is not None
     assert rows["reward"].tolist() == [[pytest.approx(2.0)] * 2, [pytest.approx(3.0)] * 2]
     assert rows["length"].tolist() == [[3.0, 3.0], [2.0, 2.0]]
-    assert rows["ended"].tolist() == [[False, False], [True, True]]
-    assert not rows["terminal"].any()
+    assert rows["done"].tolist() == [[False, False], [True, True]]
+    assert not rows["terminated"].any()
     for key, (first, second) in {"": (seen[0], seen[3]), "next_": (seen[3], seen[5])}.items():
         assert torch.equal(rows[f"{key}pairs"], torch.stack((first.pairs, second.pairs)))
 
 
-@pytest.mark.parametrize("terminal", [False, True])
-def test_returns_of_decisions_by_hand(terminal: bool) -> None:
+@pytest.mark.parametrize("terminated", [False, True])
+def test_returns_of_decisions_by_hand(terminated: bool) -> None:
     """Lambda 1: the second decision had 2 of 3 steps, so what follows it is discounted by 0.5 ** (2 / 3)."""
     algo = HiTMAC(config(), SPEC, 1, seeded())
     flat_value(algo, 8.0)
-    play(algo, [1.0, 2.0, 3.0, 4.0, 5.0], terminal=terminal, truncated=not terminal)
+    play(algo, [1.0, 2.0, 3.0, 4.0, 5.0], terminated=terminated, truncated=not terminated)
     rows = algo.decisions.take()
     assert rows is not None
     data = algo.coordinator.judge(rows)
-    second = (4 + 5) / 3 + (0 if terminal else 0.5 ** (2 / 3) * 8)
+    second = (4 + 5) / 3 + (0 if terminated else 0.5 ** (2 / 3) * 8)
     first = (1 + 2 + 3) / 3 + 0.5 * second
     assert data["target"].tolist() == pytest.approx([first, second], abs=1e-4)
     assert data["advantage"].sign().tolist() == ([1, -1] if first > second else [-1, 1])
@@ -250,7 +252,7 @@ def test_environments_that_are_out_of_step_keep_their_own_decisions() -> None:
     decisions = Decisions(2, torch.device("cpu"))
 
     def add(value: float, done: list[bool]) -> None:
-        rows = {"x": torch.tensor([value, 10 * value]), "ended": torch.zeros(2, dtype=torch.bool)}
+        rows = {"x": torch.tensor([value, 10 * value]), "done": torch.zeros(2, dtype=torch.bool)}
         decisions.add(rows, torch.tensor(done))
 
     add(1.0, [True, False])
@@ -261,7 +263,7 @@ def test_environments_that_are_out_of_step_keep_their_own_decisions() -> None:
     assert rows is not None
     assert rows["x"].tolist() == [[1.0, 20.0], [3.0, 0.0]]
     assert rows["filled"].tolist() == [[True, True], [True, False]]
-    assert rows["ended"].tolist() == [[False, True], [True, True]]
+    assert rows["done"].tolist() == [[False, True], [True, True]]
     assert decisions.take() is None
 
 
@@ -269,7 +271,7 @@ def test_out_of_step_decisions_bootstrap_from_their_own_successors() -> None:
     algo = HiTMAC(config(rollout=2), SPEC, 2, seeded())
     seen, after = observation(2), observation(2)
     common = {"assignment": torch.zeros(2, N, M), "chance": torch.zeros(2, N, M), "length": torch.full((2,), 3.0)}
-    flags = {"terminal": torch.zeros(2).bool(), "ended": torch.zeros(2).bool(), "reward": torch.zeros(2)}
+    flags = {"terminated": torch.zeros(2).bool(), "done": torch.zeros(2).bool(), "reward": torch.zeros(2)}
     rows = common | flags | pack(seen) | pack(after, "next_")
     for done in ([True, True], [True, False]):
         algo.decisions.add(rows, torch.tensor(done))

@@ -213,7 +213,7 @@ def test_targets_and_advantages_by_hand(
     algo = method(sees, gamma=0.5, lam=0.5, standardise=standardise)
     constant(algo.critic.net, [2.0])
     algo.observe(acted(algo, torch.tensor([1.0])))
-    algo.observe(acted(algo, torch.tensor([3.0]), terminal=torch.tensor([True])))
+    algo.observe(acted(algo, torch.tensor([3.0]), terminated=torch.tensor([True])))
     advantage, value, found = judged(monkeypatch, algo)
     assert torch.equal(value, torch.full((2, N), 2.0))
     assert torch.allclose(found, torch.tensor(target).unsqueeze(1).expand(2, N), atol=1e-4)
@@ -232,11 +232,11 @@ def test_rewards_are_standardised_before_the_returns(monkeypatch: pytest.MonkeyP
 def test_values_are_taken_back_to_the_scale_of_returns(monkeypatch: pytest.MonkeyPatch) -> None:
     """The critic says 1, which is 10 + 4 x 1; reward 7: 7 + 0.5 x 14 is what is to be learned."""
     algo = method(gamma=0.5, rollout=1)
-    algo.standard.sums = torch.tensor([1.0, 10.0, 116.0])
+    algo.standardiser.sums = torch.tensor([1.0, 10.0, 116.0])
     constant(algo.critic.net, [1.0])
     algo.observe(acted(algo, torch.tensor([7.0])))
     _, _, target = judged(monkeypatch, algo)
-    assert torch.allclose(algo.standard.value(target), torch.full((1, N), 14.0), atol=1e-3)
+    assert torch.allclose(algo.standardiser.value(target), torch.full((1, N), 14.0), atol=1e-3)
 
 
 @given(st.lists(st.integers(-100, 100), min_size=2, max_size=30))
@@ -254,7 +254,7 @@ def test_a_value_far_off_is_learned_from_linearly() -> None:
     """Error 3, linear from 1 on: 1 x (3 - 0.5)."""
     algo = method(rollout=1, standardise="none", huber=1.0)
     constant(algo.critic.net, [0.0])
-    algo.observe(acted(algo, torch.tensor([3.0]), terminal=torch.tensor([True])))
+    algo.observe(acted(algo, torch.tensor([3.0]), terminated=torch.tensor([True])))
     assert algo.update()["value_loss"].item() == pytest.approx(2.5)
 
 
@@ -302,7 +302,7 @@ def test_entropy_alone_makes_a_policy_uniform(entropy: float) -> None:
     constant(algo.actor.net, [1.0, 0.0, 0.0])
     constant(algo.critic.net, [0.0])
     before = algo._policy(observation()).exp().max()
-    algo.observe(acted(algo, torch.ones(4), terminal=torch.ones(4, dtype=torch.bool)))
+    algo.observe(acted(algo, torch.ones(4), terminated=torch.ones(4, dtype=torch.bool)))
     algo.update()
     after = algo._policy(observation()).exp().max()
     assert after < before - 0.05 if entropy else torch.equal(after, before)
@@ -334,7 +334,7 @@ def test_a_bandit_is_learned(objective: str) -> None:
         obs = observation(32)
         action, _, extra = algo.act(obs, {}, seeded(k), explore=True)
         reward = (action == torch.where(obs.agents.squeeze(-1) > 0, 1, 2)).float().mean(-1)
-        algo.observe(acted(algo, reward, obs, action=action, extra=extra, terminal=yes))
+        algo.observe(acted(algo, reward, obs, action=action, extra=extra, terminated=yes))
         algo.update()
     obs = observation(500)
     best = torch.where(obs.agents.squeeze(-1) > 0, 1, 2)

@@ -9,7 +9,7 @@ from torch import Generator, Tensor, nn
 
 from rhmc.algorithms.rhmc import Config
 from rhmc.envs import coverage, make_env
-from rhmc.hierarchy.mixing_executor import MixedExecutor
+from rhmc.hierarchy.mixing_executor import QMIXExecutor
 from rhmc.learning.learner import pack
 from rhmc.types import Batch, Obs, Spec, Transition
 from tests.doubles import Known
@@ -28,14 +28,14 @@ def _seed() -> None:
     torch.manual_seed(0)
 
 
-def executor(**changes: Any) -> MixedExecutor:
+def executor(**changes: Any) -> QMIXExecutor:
     settings = {"executor": "mixed", "hidden": 16, "gamma_l": 0.5} | changes
-    return MixedExecutor(Config(**settings), SPEC, seeded())
+    return QMIXExecutor(Config(**settings), SPEC, seeded())
 
 
 def rows(batch: int = 1, **changes: Tensor) -> Batch:
     obs = [Obs(torch.randn(batch, N, 1), torch.randn(batch, N, M, 4), torch.zeros(batch, N, N, 0), None) for _ in "ab"]
-    some = pack(obs[0]) | pack(obs[1], "next_") | {"terminal": torch.zeros(batch, dtype=torch.bool)}
+    some = pack(obs[0]) | pack(obs[1], "next_") | {"terminated": torch.zeros(batch, dtype=torch.bool)}
     held = (torch.rand(batch, N, M) < 0.5).float()
     return some | {"assignment": held, "action": torch.zeros(batch, N, dtype=torch.int64)} | changes
 
@@ -47,27 +47,27 @@ class Doubling(nn.Module):
         return (values * torch.tensor([2.0, 1.0])).sum(-1, keepdim=True) + 1
 
 
-def known(**changes: Any) -> MixedExecutor:
+def known(**changes: Any) -> QMIXExecutor:
     low = executor(lr=1e-9, **changes)
-    for net, values in ((low.q.net, NET), (low.q.slow, SLOW)):
+    for net, values in ((low.q.net, NET), (low.q.target_net, SLOW)):
         net.own, net.mixer = Known(values), Doubling()
     low.q.params = list(low.q.net.parameters())
-    low.q.slow_params = list(low.q.slow.parameters())
+    low.q.target_params = list(low.q.target_net.parameters())
     return low
 
 
-@pytest.mark.parametrize("terminal", [False, True])
-def test_target_by_hand(terminal: bool) -> None:
+@pytest.mark.parametrize("terminated", [False, True])
+def test_target_by_hand(terminated: bool) -> None:
     """The network chooses actions 1 and 2, the slow copy values them at 20 and 9; executors earn 0.5 and -1."""
-    reward, ended = torch.tensor([[0.5, -1.0]]), torch.tensor([terminal])
-    logs = known().update(rows(reward=reward, action=torch.tensor([[2, 0]]), terminal=ended))
-    target = -0.25 + (0 if terminal else 0.5 * (2 * 20 + 9 + 1))
+    reward, done = torch.tensor([[0.5, -1.0]]), torch.tensor([terminated])
+    logs = known().update(rows(reward=reward, action=torch.tensor([[2, 0]]), terminated=done))
+    target = -0.25 + (0 if terminated else 0.5 * (2 * 20 + 9 + 1))
     assert logs["low_td"].item() == pytest.approx((2 * 2 + 3 + 1 - target) ** 2, rel=1e-5)
 
 
 def test_rewards_are_standardised_before_they_are_averaged() -> None:
     low = known(standardise_l="reward")
-    low.standard.see_rewards(torch.tensor([1.0, 3.0]))  # mean 2, deviation 1
+    low.standardiser.update_rewards(torch.tensor([1.0, 3.0]))  # mean 2, deviation 1
     data = rows(reward=torch.tensor([[4.0, 3.0]]), action=torch.tensor([[2, 0]]))
     target = (2 + 1) / 2 + 0.5 * 50
     assert low.update(data)["low_td"].item() == pytest.approx((8 - target) ** 2, rel=1e-4)
@@ -75,8 +75,8 @@ def test_rewards_are_standardised_before_they_are_averaged() -> None:
 
 def test_returns_are_standardised_by_those_seen() -> None:
     low = known(standardise_l="return")
-    low.standard.see_returns(torch.tensor([4.0, 8.0]))  # mean 6, deviation 2
-    low.standard.see_returns = lambda value: None  # type: ignore[method-assign]
+    low.standardiser.update_returns(torch.tensor([4.0, 8.0]))  # mean 6, deviation 2
+    low.standardiser.update_returns = lambda value: None  # type: ignore[method-assign]
     target = 0.5 + 0.5 * (50 * 2 + 6)
     data = rows(reward=torch.full((1, N), 0.5), action=torch.tensor([[2, 0]]))
     assert low.update(data)["low_td"].item() == pytest.approx((8 - (target - 6) / 2) ** 2, rel=1e-4)
@@ -123,13 +123,13 @@ def test_rows_hold_what_is_paid_and_count_it_once(reward: str, scale: str) -> No
     obs, options = env.reset(), env.options()
     action, held = torch.ones(5, N, dtype=torch.int64), (torch.rand(5, N, M) < 0.4).float()
     s = env.step(action, held)
-    t = Transition(obs, action, s.reward, s.local, s.completed, s.terminal, s.truncated, s.final_obs, options, {})
+    t = Transition(obs, action, s.reward, s.local, s.completed, s.terminated, s.truncated, s.final_obs, options, {})
     kept = low.rows(t, held)
     if reward == "team":
         assert torch.equal(kept["reward"], s.reward.unsqueeze(-1).expand(5, N))
     else:
         assert not torch.allclose(kept["reward"][:, 0], kept["reward"][:, 1])
-    weight, total, _ = low.standard.sums
+    weight, total, _ = low.standardiser.sums
     assert (total / weight if scale == "reward" else total).item() == pytest.approx(
         kept["reward"].mean().item() if scale == "reward" else 0.0, rel=1e-4
     )
