@@ -11,7 +11,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from pydantic import BaseModel
 from torch import Tensor
 
 from pipelines.export.tables import write_tables
@@ -23,6 +22,7 @@ from rhmc.envs import ENVS
 from rhmc.learning.learner import Learner
 from rhmc.scripted.yardsticks import yardsticks
 from rhmc.training.trainer import Trainer
+from tests.blocks import fitted, flat, nested
 from tests.pipelines.support import tiny
 
 FILE = Path(__file__).with_name("digests.json")
@@ -67,22 +67,7 @@ def setting(task: str, algo: dict[str, Any], **env: Any) -> Setting:
     """A short training."""
     task_fields = {"kind": task, "observation": "extended", **env}
     small = fitted(ALGORITHMS[algo["kind"]].config, SMALL)
-    return Setting.model_validate({"env": task_fields, "algo": merged(small, algo), "trainer": RUN})
-
-
-def fitted(model: type[BaseModel], values: dict[str, Any]) -> dict[str, Any]:
-    """The values for those fields that a configuration has, in its blocks too."""
-    found: dict[str, Any] = {name: value for name, value in values.items() if name in model.model_fields}
-    for name, field in model.model_fields.items():
-        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
-            found[name] = fitted(field.annotation, values)
-    return found
-
-
-def merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    """`over` goes before `base`, block by block."""
-    blocks = {key: merged(base[key], value) for key, value in over.items() if isinstance(value, dict) and key in base}
-    return base | over | blocks
+    return Setting.model_validate({"env": task_fields, "algo": nested(small | flat(algo)), "trainer": RUN})
 
 
 def _training(task: str, algo: dict[str, Any], **env: Any) -> Callable[[], str]:

@@ -16,6 +16,8 @@ from pipelines.specs.identity import code_id
 from pipelines.specs.study import Resources, RunSpec, Setting, Study
 from pipelines.tracking.plan import Item, items
 from pipelines.workspace.process_pool import side_by_side
+from rhmc.algorithms import ALGORITHMS
+from tests.blocks import fitted, nested
 
 CODE = code_id("iql", "coverage")  # of all runs here
 
@@ -35,8 +37,12 @@ def setting(**algo: Any) -> Setting:
             },
             "trainer": {"steps": 600, "num_envs": 8, "evaluations": 3, "eval_episodes": 4, "final_episodes": 8},
         }
-        | ({"algo": {"kind": "iql", "learning_starts": 64, "batch_size": 32, **algo}} if algo else {})
+        | ({"algo": _own({"kind": "iql"} | algo)} if algo else {})
     )
+
+
+def _own(algo: dict[str, Any]) -> dict[str, Any]:
+    return nested(fitted(ALGORITHMS[algo["kind"]].config, {"learning_starts": 64, "batch_size": 32}) | algo)
 
 
 def spec(seed: int = 0, **algo: Any) -> RunSpec:

@@ -342,7 +342,8 @@ def test_faulty_grids(old: str, new: str, said: list[str]) -> None:
 
 
 def test_a_grid_too_large_to_train_is_refused_before_it_is_spelled_out() -> None:
-    keys = "algo.lr", "algo.alpha", "algo.gamma_h", "algo.gamma_l", "algo.epsilon", "algo.flip", "algo.tau"
+    keys = "algo.lr", "algo.alpha", "algo.coordinator.gamma", "algo.executor.gamma", "algo.executor.epsilon"
+    keys += "algo.coordinator.assignment_epsilon", "algo.tau"
     values = ", ".join(f"0.{i}" for i in range(10, 90))
     text = GRID.replace("  env.agents: [2, 4]\n", "").replace("  algo.lr: [1e-3, 5e-5]\n", "")
     text = text.replace("grid:\n", "grid:\n" + "".join(f"  {key}: [{values}]\n" for key in keys))
@@ -473,7 +474,9 @@ PARTS = [
     (
         "iql, encoder: pairwise",
         "iql, encoder: pairwise, horizon: 2",
-        ["9:46: arms.IQL.algo.horizon: unknown key 'horizon'; allowed: buffer, batch, ...epsilon_steps, kind"],
+        [
+            "9:46: arms.IQL.algo.horizon: unknown key 'horizon'; allowed: buffer_size, learning_starts, ...epsilon_steps, kind"
+        ],
     ),
     # values
     ("regulator: none", "regulator: papr", ["8:23: arms.none.algo.regulator: 'papr' is not allowed; ... 'paper'?"]),

@@ -13,12 +13,13 @@ from torch import Generator, Tensor, nn
 from rhmc.algorithms.hitmac import PRACTISED, Config, Decisions, HiTMAC, practice
 from rhmc.envs import coverage, make_env
 from rhmc.envs.base import Env
-from rhmc.hierarchy.attention import Assigner, Contributions, likelihood, orders
+from rhmc.hierarchy.attention import Assigner, Contributions, Settings, likelihood, orders
 from rhmc.learning.learner import pack
 from rhmc.networks.nets import Sizes
 from rhmc.training.trainer import Config as Budget
 from rhmc.training.trainer import Trainer
 from rhmc.types import Batch, Local, Obs, Spec, Transition
+from tests.blocks import nested
 from tests.conformance import DifferentError, assert_same
 
 SPEC = Spec(2, 3, agent_features=0, pair_features=4, peer_features=0, actions=3, continuous=False, episode=7)
@@ -34,12 +35,15 @@ def _seed() -> None:
     torch.manual_seed(0)
 
 
+OWN = {name: f"coordinator.{name}" for name in Settings.model_fields}
+
+
 def config(**changes: Any) -> Config:
-    return Config(
-        **{"hidden": 8, "batch": 8, "buffer": 64, "warmup": 8, "steps_per_update": 4, "pretrain": 0}
-        | {"assignment_period": 3, "rollout": 2, "epochs": 1, "minibatches": 1, "gamma": 0.5, "standardise": "none"}
-        | changes
-    )
+    """Changes without a block are of the coordinator where it has such a field."""
+    settings = {"hidden_dim": 8, "executor.batch_size": 8, "buffer_size": 64, "learning_starts": 8, "train_freq": 4}
+    settings |= {"pretrain": 0, "assignment_period": 3}
+    own = {"n_steps": 2, "epochs": 1, "minibatches": 1, "gamma": 0.5, "standardise": "none"} | changes
+    return Config(**nested(settings | {OWN.get(name, name): value for name, value in own.items()}))
 
 
 def observation(batch: int, first: bool = False) -> Obs:
@@ -236,7 +240,7 @@ def test_returns_of_decisions_by_hand(terminated: bool) -> None:
 
 
 def test_half_a_lambda_mixes_in_the_critics_word() -> None:
-    algo = HiTMAC(config(lam=0.5), SPEC, 1, seeded())
+    algo = HiTMAC(config(gae_lambda=0.5), SPEC, 1, seeded())
     flat_value(algo, 8.0)
     play(algo, [1.0] * 6, truncated=True)
     rows = algo.decisions.take()
@@ -268,7 +272,7 @@ def test_environments_that_are_out_of_step_keep_their_own_decisions() -> None:
 
 
 def test_out_of_step_decisions_bootstrap_from_their_own_successors() -> None:
-    algo = HiTMAC(config(rollout=2), SPEC, 2, seeded())
+    algo = HiTMAC(config(n_steps=2), SPEC, 2, seeded())
     seen, after = observation(2), observation(2)
     common = {"assignment": torch.zeros(2, N, M), "chance": torch.zeros(2, N, M), "length": torch.full((2,), 3.0)}
     flags = {"terminated": torch.zeros(2).bool(), "done": torch.zeros(2).bool(), "reward": torch.zeros(2)}
@@ -317,7 +321,7 @@ def decided(algo: HiTMAC, advantage: float) -> Batch:
 
 @pytest.mark.parametrize("advantage", [1.0, -1.0])
 def test_the_policy_goes_where_the_advantage_points_as_far_as_the_clip(advantage: float) -> None:
-    algo = HiTMAC(config(lr=1e-2, entropy=0.0), SPEC, 4, seeded())
+    algo = HiTMAC(config(lr=1e-2, ent_coef=0.0), SPEC, 4, seeded())
     rows, ratios = decided(algo, advantage), []
     for _ in range(80):
         logs = algo.coordinator.improve(rows)
@@ -422,7 +426,7 @@ def test_the_coordinator_takes_over_everywhere_at_once() -> None:
 
 
 def test_a_run_continues_from_any_step_of_both_phases_bit_for_bit() -> None:
-    again = {"epochs": 2, "minibatches": 2, "rollout": 3}
+    again = {"epochs": 2, "minibatches": 2, "n_steps": 3}
     run, states, items = trainer(**again), [], []
     for item in run:
         items.append(item)
@@ -440,7 +444,7 @@ def test_a_run_continues_from_any_step_of_both_phases_bit_for_bit() -> None:
 
 def test_one_pass_in_one_batch_is_the_plain_actor_critic() -> None:
     """The ratio is 1 then, and the gradient that of the advantage times the log-likelihood, per pair."""
-    algo = HiTMAC(config(entropy=0.0), SPEC, 4, seeded())
+    algo = HiTMAC(config(ent_coef=0.0), SPEC, 4, seeded())
     rows = decided(algo, 1.0) | {"advantage": torch.randn(32)}
     obs = Obs(rows["agents"], rows["pairs"], rows["peers"], torch.zeros(32).bool())
     chance = likelihood(algo.coordinator.actor.net(obs), rows["assignment"]).sum((1, 2))

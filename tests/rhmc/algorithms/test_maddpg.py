@@ -21,7 +21,7 @@ from tests.conformance import assert_same
 N, A = 3, 2
 SPEC = Spec(N, 2, agent_features=1, pair_features=4, peer_features=2, actions=A, continuous=False, episode=9)
 FORCE = navigation.Config(agents=3, continuous=True, episode=7)
-SMALL: dict[str, Any] = {"hidden": 8, "buffer": 40, "batch": 8, "warmup": 12, "steps_per_update": 4}
+SMALL: dict[str, Any] = {"hidden_dim": 8, "buffer_size": 40, "batch_size": 8, "learning_starts": 12, "train_freq": 4}
 RUN = Run(steps=44, num_envs=4, evaluations=5, eval_episodes=2, final_episodes=2)
 either = pytest.mark.parametrize("continuous", [False, True], ids=["discrete", "continuous"])
 both = pytest.mark.parametrize("encoder", ["mlp", "pairwise"])
@@ -272,7 +272,7 @@ def test_no_others_action_reaches_an_agents_value_with_a_gradient(encoder: str, 
 @both
 @either
 def test_an_update_moves_both_networks_each_by_its_own_loss(encoder: str, continuous: bool) -> None:
-    algo = method(continuous, encoder=encoder, warmup=0, steps_per_update=1, polyak=0.9)
+    algo = method(continuous, encoder=encoder, learning_starts=0, train_freq=1, tau=0.1)
     algo.experience.add(rows(continuous), 1)
     before = [p.detach().clone() for p in (*algo.actor.params, *algo.critic.params)]
     slow = [p.clone() for p in (*algo.actor.target_params, *algo.critic.target_params)]

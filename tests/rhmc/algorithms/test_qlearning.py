@@ -51,7 +51,7 @@ SLOW = [[50.0, 40.0, 30.0], [7.0, 8.0, 9.0]]  # would choose 0 and 2
 def learner(kind: str, **changes: Any) -> QLearning:
     """A method with known values in place of its networks; QMIX's mixer makes 2 a + b + 1 of values a and b."""
     method = ALGORITHMS[kind]
-    settings = {"gamma": 0.5, "standardise": "none", "lr": 1e-9, "embed": 1, "hidden": 4} | changes
+    settings = {"gamma": 0.5, "standardise": "none", "lr": 1e-9, "mixing_embed_dim": 1, "hidden_dim": 4} | changes
     cfg = method.config(**{key: value for key, value in settings.items() if key in method.config.model_fields})
     built = method.build(cfg, SPEC, 1, seeded())
     assert isinstance(built, QLearning)
@@ -87,7 +87,7 @@ def test_targets_by_hand(kind: str, double: bool) -> None:
     for reward, live, now in ((0.25, 1, mixed(kind, 1, 3)), (-4, 0, mixed(kind, 2, 0.5))):
         expected += [(q - (reward + 0.5 * live * v)) ** 2 for q, v in zip(now, later, strict=True)]
     data = rows([0.25, -4.0], [False, True], [[1, 0], [2, 1]])
-    assert loss(learner(kind, double=double), data) == pytest.approx(sum(expected) / len(expected), rel=1e-5)
+    assert loss(learner(kind, double_q=double), data) == pytest.approx(sum(expected) / len(expected), rel=1e-5)
 
 
 @pytest.mark.parametrize("kind", KINDS)

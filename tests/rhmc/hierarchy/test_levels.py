@@ -18,6 +18,7 @@ from rhmc.learning.learner import Learner, pack
 from rhmc.learning.normalisation import KEPT
 from rhmc.networks.nets import ENCODERS, PairNet, Sizes, append
 from rhmc.types import Batch, Obs, Spec, Transition, assigned_reward
+from tests.blocks import nested
 from tests.oracles import regulation as oracle
 
 SPEC = Spec(2, 3, agent_features=1, pair_features=4, peer_features=0, actions=3, continuous=False, episode=9)
@@ -34,7 +35,8 @@ def _seed() -> None:
 
 
 def config(**changes: Any) -> Config:
-    return Config(**{"hidden": 16, "batch": 8, "batch_h": 8, "gamma_l": 0.5, "gamma_h": 0.25} | changes)
+    few = {"hidden_dim": 16, "executor.batch_size": 8, "coordinator.batch_size": 8}
+    return Config(**nested(few | {"executor.gamma": 0.5, "coordinator.gamma": 0.25} | changes))
 
 
 def observation(batch: int) -> Obs:
@@ -89,7 +91,9 @@ def test_executor_target_by_hand(encoder: str, terminated: bool) -> None:
 @pytest.mark.parametrize("gradient", ["gumbel", "expected"])
 @pytest.mark.parametrize("encoder", ["mlp", "pairwise"])
 def test_executor_goes_up_a_critic_that_prefers_one_action(gradient: str, encoder: str) -> None:
-    low = Executor(config(encoder=encoder, executor=gradient, lr=0.01, logit_penalty=0.0), SPEC, seeded())
+    low = Executor(
+        config(encoder=encoder, executor__method=gradient, lr=0.01, executor__logit_penalty=0.0), SPEC, seeded()
+    )
     constant(low.critic.net, [0.0, 0.0, 3.0])
     low.critic = Learner(low.critic.net, lr=0.0)
     data = rows(64, reward=torch.zeros(64, N), action=torch.zeros(64, N, dtype=torch.int64))
@@ -106,7 +110,7 @@ def test_executor_goes_up_a_critic_that_prefers_one_action(gradient: str, encode
 
 
 def test_executor_explores_by_a_share_of_random_actions() -> None:
-    low = Executor(config(epsilon=0.3), SPEC, seeded())
+    low = Executor(config(executor__epsilon=0.3), SPEC, seeded())
     constant(low.actor.net, [20.0, 0.0, 0.0])
     drawn = low.act(observation(10_000), torch.zeros(10_000, N, M), seeded(), explore=True)
     share = drawn.flatten().bincount(minlength=3) / drawn.numel()
@@ -200,7 +204,7 @@ def _values(learner: Learner) -> list[Tensor]:
 @pytest.mark.parametrize("terminated", [False, True])
 def test_coordinator_target_by_hand(gradient: str, encoder: str, terminated: bool) -> None:
     """The critic is a sum over the six pairs: 6 x 0.5 now, 6 x 2 later."""
-    high = Coordinator(config(encoder=encoder, coordinator=gradient), SPEC, seeded())
+    high = Coordinator(config(encoder=encoder, coordinator__gradient=gradient), SPEC, seeded())
     constant(high.critic.net, [0.5])
     constant(high.critic.target_net, [2.0])
     logs = high.update(rows(terminated=terminated, reward=torch.tensor([0.75]), earned=torch.tensor([0.0])))
@@ -211,7 +215,7 @@ def test_coordinator_target_by_hand(gradient: str, encoder: str, terminated: boo
 def test_coordinator_standardises_rewards_or_returns_by_those_seen() -> None:
     """Rewards of mean 2 and deviation 1; returns of mean 6 and deviation 2, the next one put out as 12 of them."""
     for scale, target in (("reward", (0.75 - 2) + 0.25 * 12), ("return", (0.75 + 0.25 * (12 * 2 + 6) - 6) / 2)):
-        high = Coordinator(config(encoder="mlp", standardise_h=scale), SPEC, seeded())
+        high = Coordinator(config(encoder="mlp", coordinator__standardise=scale), SPEC, seeded())
         constant(high.critic.net, [0.5])
         constant(high.critic.target_net, [2.0])
         high.standardiser.update_rewards(torch.tensor([1.0, 3.0]))
@@ -224,7 +228,7 @@ def test_coordinator_standardises_rewards_or_returns_by_those_seen() -> None:
 def test_executor_standardises_rewards_or_returns_by_those_seen() -> None:
     """As above; the slow critic puts out 20 for the action that the slow actor chooses."""
     for scale, target in (("reward", (0.5 - 2) + 0.5 * 20), ("return", (0.5 + 0.5 * (20 * 2 + 6) - 6) / 2)):
-        low = Executor(config(encoder="mlp", standardise_l=scale), SPEC, seeded())
+        low = Executor(config(encoder="mlp", executor__standardise=scale), SPEC, seeded())
         constant(low.critic.net, [1.0, 2.0, 4.0])
         constant(low.critic.target_net, [10.0, 20.0, 40.0])
         constant(low.actor.target_net, [0.0, 3.0, 1.0])
@@ -239,7 +243,13 @@ def test_executor_standardises_rewards_or_returns_by_those_seen() -> None:
 
 def test_each_level_counts_its_own_rewards() -> None:
     """The coordinator what it is paid for ended periods, the executors theirs at every step."""
-    cfg = config(standardise_l="reward", standardise_h="reward", assignment_period=2, regulator="none", warmup=10**6)
+    cfg = config(
+        executor__standardise="reward",
+        coordinator__standardise="reward",
+        assignment_period=2,
+        regulator="none",
+        learning_starts=10**6,
+    )
     env = make_env(coverage.Config(agents=N, targets=M), 5, seeded(1))
     algo = RHMC(cfg, env.spec, 5, seeded())
     obs, carry = env.reset(), algo.carry(5)
@@ -290,7 +300,7 @@ WEIGHT = torch.tensor([[1.0, -1.0, 0.5], [-2.0, 0.8, -0.5]])
 
 def taught(critic: Taught, gradient: str, updates: int) -> tuple[Tensor, Tensor]:
     """Logits (N, M) in one state, before and after next_values a known critic."""
-    high = Coordinator(config(coordinator=gradient, lr=3e-3, entropy=0.0), SPEC, seeded())
+    high = Coordinator(config(coordinator__gradient=gradient, lr=3e-3, coordinator__ent_coef=0.0), SPEC, seeded())
     high.critic = Learner(critic, lr=0.0)
     data = rows(1, reward=torch.zeros(1), earned=torch.zeros(1))
     data = {key: value.repeat_interleave(64, 0) for key, value in data.items()}
@@ -353,7 +363,7 @@ def test_worth_of_a_known_critic() -> None:
 
 
 def test_coordinator_assigns_by_its_logits_and_flips_a_share() -> None:
-    high = Coordinator(config(flip=0.2), SPEC, seeded())
+    high = Coordinator(config(coordinator__assignment_epsilon=0.2), SPEC, seeded())
     obs = observation(5000)
     for logit, chance in ((30.0, 0.9), (-30.0, 0.1), (0.0, 0.5)):
         constant(high.actor.net, [logit])
@@ -403,7 +413,7 @@ def play(algo: RHMC, env: Env, steps: int) -> Iterator[Played]:
 
 def begin(world: str, batch: int, **changes: Any) -> tuple[RHMC, Env]:
     env = make_env(WORLDS[world], batch, seeded(4))
-    return RHMC(config(**{"buffer": 200, "horizon": 2} | changes), env.spec, batch, seeded(5)), env
+    return RHMC(config(**{"buffer_size": 200, "horizon": 2} | changes), env.spec, batch, seeded(5)), env
 
 
 @pytest.mark.parametrize("world", WORLDS)
@@ -415,7 +425,7 @@ def test_high_rows_are_those_of_the_periods_worked_out_one_by_one(world: str, re
     An episode of 7 steps cuts a period of 3 short: 3 + 3 + 1.
     """
     alpha = 0.3
-    algo, env = begin(world, 24, regulator=regulator, assignment_period=period, alpha=alpha, buffer=900)
+    algo, env = begin(world, 24, regulator=regulator, assignment_period=period, alpha=alpha, buffer_size=900)
     expected: list[dict[str, Any]] = []
     periods: list[dict[str, Any]] = [{} for _ in range(24)]
     for step, (t, table, _) in enumerate(play(algo, env, 17)):
@@ -472,7 +482,7 @@ def test_an_assignment_is_held_for_its_period_and_drawn_anew_when_an_episode_sta
 
 
 def test_the_first_update_is_due_after_the_warm_up_and_then_at_the_set_rate() -> None:
-    algo, env = begin("coverage", 4, warmup=10, steps_per_update=8)
+    algo, env = begin("coverage", 4, learning_starts=10, train_freq=8)
     counts, before = [], 0
     for played in play(algo, env, 10):
         counts.append(algo.state_dict()["low"]["updates"])

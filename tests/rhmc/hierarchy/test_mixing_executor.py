@@ -12,6 +12,7 @@ from rhmc.envs import coverage, make_env
 from rhmc.hierarchy.mixing_executor import QMIXExecutor
 from rhmc.learning.learner import pack
 from rhmc.types import Batch, Obs, Spec, Transition
+from tests.blocks import nested
 from tests.doubles import Known
 
 SPEC = Spec(2, 3, agent_features=1, pair_features=4, peer_features=0, actions=3, continuous=False, episode=9)
@@ -29,8 +30,8 @@ def _seed() -> None:
 
 
 def executor(**changes: Any) -> QMIXExecutor:
-    settings = {"executor": "mixed", "hidden": 16, "gamma_l": 0.5} | changes
-    return QMIXExecutor(Config(**settings), SPEC, seeded())
+    settings = {"executor.method": "qmix", "hidden_dim": 16, "executor.gamma": 0.5} | changes
+    return QMIXExecutor(Config(**nested(settings)), SPEC, seeded())
 
 
 def rows(batch: int = 1, **changes: Tensor) -> Batch:
@@ -66,7 +67,7 @@ def test_target_by_hand(terminated: bool) -> None:
 
 
 def test_rewards_are_standardised_before_they_are_averaged() -> None:
-    low = known(standardise_l="reward")
+    low = known(executor__standardise="reward")
     low.standardiser.update_rewards(torch.tensor([1.0, 3.0]))  # mean 2, deviation 1
     data = rows(reward=torch.tensor([[4.0, 3.0]]), action=torch.tensor([[2, 0]]))
     target = (2 + 1) / 2 + 0.5 * 50
@@ -74,7 +75,7 @@ def test_rewards_are_standardised_before_they_are_averaged() -> None:
 
 
 def test_returns_are_standardised_by_those_seen() -> None:
-    low = known(standardise_l="return")
+    low = known(executor__standardise="return")
     low.standardiser.update_returns(torch.tensor([4.0, 8.0]))  # mean 6, deviation 2
     low.standardiser.update_returns = lambda value: None  # type: ignore[method-assign]
     target = 0.5 + 0.5 * (50 * 2 + 6)
@@ -104,7 +105,7 @@ def test_own_values_and_the_mixture_know_the_assignment() -> None:
 
 
 def test_explores_by_a_share_of_random_actions() -> None:
-    low = known(epsilon=0.3)
+    low = known(executor__epsilon=0.3)
     obs = Obs(torch.zeros(9000, N, 1), torch.zeros(9000, N, M, 4), torch.zeros(9000, N, N, 0), None)
     held = torch.zeros(9000, N, M)
     drawn = low.act(obs, held, seeded(), explore=True)
@@ -117,7 +118,7 @@ def test_explores_by_a_share_of_random_actions() -> None:
 @pytest.mark.parametrize(("reward", "scale"), list(product(("local", "team"), ("none", "reward"))))
 def test_rows_hold_what_is_paid_and_count_it_once(reward: str, scale: str) -> None:
     low, env = (
-        executor(low_reward=reward, standardise_l=scale),
+        executor(executor__reward=reward, executor__standardise=scale),
         make_env(coverage.Config(agents=N, targets=M), 5, seeded(1)),
     )
     obs, options = env.reset(), env.options()
@@ -137,7 +138,7 @@ def test_rows_hold_what_is_paid_and_count_it_once(reward: str, scale: str) -> No
 
 def test_it_learns_which_joint_action_pays() -> None:
     """Rewards 1 for actions (2, 1), else 0, on states that say nothing."""
-    low = executor(encoder="pairwise", gamma_l=0.0, lr=0.01, filter="off", share=False)
+    low = executor(encoder="pairwise", executor__gamma=0.0, lr=0.01, filter="off", share=False)
     generator = seeded(3)
     for _ in range(150):
         action = torch.randint(3, (64, N), generator=generator)

@@ -33,9 +33,8 @@ def through_a_file(state: Any) -> Any:
 
 
 def experience(seed: int = 0, **changes: int) -> Experience:
-    return Experience(
-        OffPolicy(**{"buffer": 50, "batch": 4, "warmup": 10, "steps_per_update": 3} | changes), seeded(seed)
-    )
+    cfg = OffPolicy(**{"buffer_size": 50, "batch_size": 4, "learning_starts": 10, "train_freq": 3} | changes)
+    return Experience(cfg, cfg.batch_size, seeded(seed))
 
 
 def drawn(due: Experience) -> list[list[float]]:
@@ -46,7 +45,7 @@ def drawn(due: Experience) -> list[list[float]]:
 @given(st.lists(st.integers(1, 9), max_size=12), st.integers(0, 20), st.integers(1, 7))
 def test_an_update_is_due_for_every_few_steps_after_the_warm_up(counts: list[int], warmup: int, pace: int) -> None:
     """Whenever it is asked, and as often as it was not asked before."""
-    kept, steps, updates = experience(warmup=warmup, steps_per_update=pace), 0, 0
+    kept, steps, updates = experience(learning_starts=warmup, train_freq=pace), 0, 0
     for k, count in enumerate(counts):
         kept.add({"x": torch.arange(steps, steps + count).float()}, count)
         steps += count
@@ -58,7 +57,7 @@ def test_an_update_is_due_for_every_few_steps_after_the_warm_up(counts: list[int
 
 def test_steps_are_counted_and_not_rows() -> None:
     """A row may stand for a period of many steps, or be missing."""
-    kept = experience(warmup=0, steps_per_update=5)
+    kept = experience(learning_starts=0, train_freq=5)
     kept.add({"x": torch.ones(1)}, 10)
     assert len(drawn(kept)) == 2
     kept.add({"x": torch.ones(0)}, 5)
@@ -66,7 +65,7 @@ def test_steps_are_counted_and_not_rows() -> None:
 
 
 def test_nothing_is_due_from_an_empty_replay() -> None:
-    kept = experience(warmup=0)
+    kept = experience(learning_starts=0)
     kept.add({"x": torch.ones(0)}, 30)
     assert drawn(kept) == []
     kept.add({"x": torch.ones(1)}, 0)
@@ -74,7 +73,7 @@ def test_nothing_is_due_from_an_empty_replay() -> None:
 
 
 def test_a_batch_has_its_size_and_is_of_rows_seen() -> None:
-    kept = experience(batch=7, buffer=5)
+    kept = experience(batch_size=7, buffer_size=5)
     kept.add({"x": torch.arange(16).float()}, 16)
     got = drawn(kept)
     assert [len(batch) for batch in got] == [7, 7]
