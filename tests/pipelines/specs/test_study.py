@@ -474,9 +474,7 @@ PARTS = [
     (
         "iql, encoder: pairwise",
         "iql, encoder: pairwise, horizon: 2",
-        [
-            "9:46: arms.IQL.algo.horizon: unknown key 'horizon'; allowed: buffer_size, learning_starts, ...epsilon_steps, kind"
-        ],
+        ["9:46: arms.IQL.algo.horizon: unknown key 'horizon'; allowed: buffer_size, ...epsilon_steps, kind"],
     ),
     # values
     ("regulator: none", "regulator: papr", ["8:23: arms.none.algo.regulator: 'papr' is not allowed; ... 'paper'?"]),
