@@ -117,3 +117,9 @@ def test_a_block_is_merged_named_and_searched_by_dotted_path(tmp_path: Path) -> 
     from pipelines.specs.study import changes
 
     assert changes(study.base, study.arms["b"]) == {"algo.coordinator.gamma": 0.8}
+
+
+@pytest.mark.parametrize(("suffix", "block"), [("h", "coordinator"), ("l", "executor")])
+def test_a_level_of_old_keys_is_one_block(suffix: str, block: str) -> None:
+    blocks = {name.partition(".")[0] for old, e in RENAMED.items() if old.endswith(f"_{suffix}") for name in e.names}
+    assert blocks == {block}
