@@ -40,7 +40,7 @@ def imitate(view: str, hidden: int, steps: int) -> Copied:
     env = make_env(CFG, COPIES, rng)
     encoder = ENCODERS["pairwise"]
     net = {"local": encoder.local, "central": encoder.central}[view](Sizes.of(env.spec), hidden, env.spec.actions)
-    learner = Learner(net, lr=LR, polyak=1.0)
+    learner = Learner(net, lr=LR, tau=0.0)
     kept: list[tuple[Batch, Tensor]] = []
     obs, agreement = env.reset(), 0.0
     for step in range(0, steps, COPIES):

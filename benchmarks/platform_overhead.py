@@ -207,7 +207,7 @@ def platform(changes: list[str], out: Path) -> None:
 def changes(minutes: float) -> list[str]:
     """What makes the study one of four runs and so long."""
     steps = round(60 * minutes / RUNS * RATE)
-    profile = "profiles.quick.trainer={anneal: 0.05, evaluations: 20, eval_episodes: 100}"  # whatever quick's is now
+    profile = "profiles.quick.trainer={final_lr_fraction: 0.05, evaluations: 20, eval_episodes: 100}"  # and not quick's
     return ["profiles.quick.arms=[full, no filter]", profile, f"seeds={RUNS // 2}", f"steps={steps}"]
 
 

@@ -40,12 +40,12 @@ FILE = """\
 question: What do the learning rate and the discount do to each other?
 base:
   env: {{kind: coverage, preset: flat, agents: 2, targets: 2}}
-  algo: {{kind: iql, hidden: 16, batch: 32, warmup: 64, buffer: 400}}
+  algo: {{kind: iql, hidden_dim: 16, batch_size: 32, learning_starts: 64, buffer_size: 400}}
   trainer: {{num_envs: 8, evaluations: {points}}}
 grid:
   algo.lr: [{rates}]
   algo.gamma: [0.90, 0.91, 0.92, 0.93, 0.94, 0.95, 0.96, 0.97, 0.98, 0.99]
-  algo.polyak: [0.990, 0.991, 0.992, 0.993, 0.994, 0.995, 0.996, 0.997, 0.998, 0.999]
+  algo.tau: [0.001, 0.002, 0.003, 0.004, 0.005, 0.006, 0.007, 0.008, 0.009, 0.010]
 seeds: 10
 steps: 100_000
 resources: {{animate: none}}

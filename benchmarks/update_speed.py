@@ -1,4 +1,4 @@
-"""What one update of a network costs, by how it is done: batch, optimiser, slow copy, torch.compile. Prints Markdown.
+"""What one update of a network costs: by batch, optimiser, target network, torch.compile. Prints Markdown.
 
 The network is the executors' critic with the pairwise encoder on the coverage task's extended observation, the largest
 part of RHMC's training time. Milliseconds of processor time, one torch thread; forward and backward pass where an
@@ -61,7 +61,7 @@ def step(**options: bool) -> float:
 
 
 def follow(*, foreach: bool) -> float:
-    """A step of a slow copy towards its network."""
+    """A step of a target network towards its network."""
     slow: list[Tensor] = list(critic().parameters())
     fast: list[Tensor] = list(critic().parameters())
 
@@ -88,7 +88,7 @@ def main() -> None:
     for name, options in (("fused", {"fused": True}), ("foreach", {"foreach": True}), ("a loop", {"foreach": False})):
         print(f"| step of Adam, {name} | {step(**options):.3f} | |")
     for foreach in (True, False):
-        print(f"| slow copy, {'foreach' if foreach else 'a loop'} | {follow(foreach=foreach):.3f} | |", flush=True)
+        print(f"| target network, {'foreach' if foreach else 'a loop'} | {follow(foreach=foreach):.3f} | |", flush=True)
 
 
 if __name__ == "__main__":

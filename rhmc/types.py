@@ -1,4 +1,4 @@
-"""The words that environments and algorithms share.
+"""Types that environments and algorithms share.
 
 Shape letters: B environments, N agents, M targets, D options of an agent (regulator), F features.
 """
@@ -38,7 +38,7 @@ class Spec(NamedTuple):
 
 
 class Obs(NamedTuple):
-    """What every agent sees. Row i of each tensor is all that agent i may use when it acts alone."""
+    """Observations of all agents. Row i of each tensor is all that agent i may use when it acts alone."""
 
     agents: Tensor  # (B, N, Fa) own features
     pairs: Tensor  # (B, N, M, Fp) agent i about target j
@@ -61,8 +61,8 @@ class Step(NamedTuple):
     reward: Tensor  # (B,) team reward
     local: Local
     completed: Tensor  # (B, N, M) bool, agent i completes target j now (sees it, stands on it)
-    terminal: Tensor  # (B,) bool, ended by the task: no bootstrap
-    truncated: Tensor  # (B,) bool, ended by the time limit
+    terminated: Tensor  # (B,) bool, the task ended: no bootstrap
+    truncated: Tensor  # (B,) bool, the time limit ended the episode: bootstrap
     info: dict[str, Tensor]  # (B,) each, logged per step
 
 
@@ -78,7 +78,7 @@ class Transition(NamedTuple):
     reward: Tensor
     local: Local
     completed: Tensor
-    terminal: Tensor
+    terminated: Tensor
     truncated: Tensor
     next_obs: Obs
     options: Callable[[int], Tensor]

@@ -54,7 +54,7 @@ def astray(state: Any) -> Iterator[tuple[str, Tensor]]:
 def _diverged(name: str, value: float, point: Metrics) -> DivergedError:
     return DivergedError(
         f"diverged: {name} is {value} at step {int(point['step']):,}; every value must be finite, so try a smaller lr "
-        "or grad_clip"
+        "or max_grad_norm"
     )
 
 

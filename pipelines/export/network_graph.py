@@ -13,7 +13,7 @@ from torch import Generator, Tensor, nn
 from rhmc.algorithms.rhmc import RHMC, Config
 from rhmc.envs import coverage, make_env
 from rhmc.hierarchy import executor
-from rhmc.hierarchy.coordinator import worth
+from rhmc.hierarchy.coordinator import assignment_value
 from rhmc.types import Obs
 
 TASK = {"agents": 4, "targets": 5}  # section 5.2
@@ -60,7 +60,7 @@ def _build(encoder: str, observation: str) -> Record:
         torch.manual_seed(0)
         method = RHMC(cfg, task.spec, 1, Generator())
     networks = list(_networks(method, task.reset()))
-    shaping = ("filter", "regulator", "horizon", "alpha", "assignment_period", "hidden", "share")
+    shaping = ("filter", "regulator", "horizon", "alpha", "assignment_period", "hidden_dim", "share")
     settings = {name: getattr(cfg, name) for name in shaping}
     spec = task.spec._asdict()
     shown = env.model_dump(mode="json", exclude={"boxes"})
@@ -82,20 +82,23 @@ def _networks(method: RHMC, obs: Obs) -> Iterator[Record]:
 
     yield trace("coordinator actor", high.actor.net, seen, lambda x: high.actor.net(view(x)))
     yield trace(
-        "coordinator critic", high.critic.net, given, lambda x: worth(high.critic.net, view(x), x["assignment"])
+        "coordinator critic",
+        high.critic.net,
+        given,
+        lambda x: assignment_value(high.critic.net, view(x), x["assignment"]),
     )
     filtered = method.cfg.filter
     yield trace(
         "executor actor",
         low.actor.net,
         given,
-        lambda x: low.actor.net(executor.seen(filtered, view(x), x["assignment"])),
+        lambda x: low.actor.net(executor.filtered_obs(filtered, view(x), x["assignment"])),
     )
     yield trace(
         "executor critic",
         low.critic.net,
         taken,
-        lambda x: low.critic.net(executor.told(view(x), x["assignment"]), joint=x["others' actions"]),
+        lambda x: low.critic.net(executor.with_assignment(view(x), x["assignment"]), joint=x["others' actions"]),
     )
 
 

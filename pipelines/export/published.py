@@ -18,7 +18,7 @@ from pipelines.specs.study import RunSpec, Study
 from pipelines.tracking.plan import items, study_card
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.process_pool import side_by_side
-from pipelines.workspace.work_folder import Home
+from pipelines.workspace.work_folder import Home, one_line
 from rhmc.training.trainer import Trainer
 
 RESULTS = Path("results")
@@ -125,7 +125,7 @@ def _spec(row: Mapping[Any, Any]) -> RunSpec:
     try:
         spec = RunSpec.model_validate(json.loads(row["config"]))
     except (ValueError, TypeError) as error:
-        raise InputError(f"{name}: its published settings are none that this code knows ({error})") from error
+        raise InputError(f"{name}: its published settings are none that this code knows ({one_line(error)})") from error
     if spec.id != row["run"]:
         raise InputError(f"{name}: published as run {row['run']}, and its settings are those of {spec.id}")
     return spec

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 from ruamel.yaml import YAML
 from ruamel.yaml.composer import Composer, MaxDepthExceededError
@@ -21,7 +22,7 @@ from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import MappingNode, ScalarNode
 from ruamel.yaml.nodes import Node as YamlNode
 
-from pipelines.specs import limits
+from pipelines.specs import limits, renamed
 from pipelines.workspace.errors import seen
 from pipelines.workspace.files import ABSENT, fault_of
 
@@ -350,8 +351,11 @@ def _fault(model: type[BaseModel], root: Node, error: ErrorDetails, hidden: tupl
     if kind == "missing":
         return Fault(node.key, path, "missing")
     if kind == "extra_forbidden":
-        allowed = [name for name in _fields(model, error["loc"][:-1]) if name not in hidden]
-        return Fault(node.key, path, f"unknown key {show(loc[-1])}; {choices(loc[-1], allowed)}")
+        return Fault(node.key, path, _unknown(loc[-1], _model(model, error["loc"][:-1]), hidden))
+    if isinstance(node.value, str) and not rest:
+        block = renamed.block_hint(loc[-1], node.value, settings(_model(model, error["loc"][:-1])))
+        if block:
+            return Fault(node.place, path, block)
     return Fault(node.place, path, f"{show(node.value)} is not allowed; {_rule(node, error)}")
 
 
@@ -367,12 +371,29 @@ def _rule(node: Node, error: ErrorDetails) -> str:
     return rule[0].lower() + rule[1:]
 
 
-def _fields(model: type[BaseModel], loc: tuple[str | int, ...]) -> list[str]:
-    """Names of the fields of the model at `loc` inside `model`; names of free keys are passed over."""
+def _unknown(key: str, model: type[BaseModel], hidden: tuple[str, ...]) -> str:
+    """The fault of a key that a model has not: its new name, or the fields that there are."""
+    allowed = [name for name in model.model_fields if name not in hidden]
+    return renamed.hint(key, settings(model)) or f"unknown key {show(key)}; {choices(key, allowed)}"
+
+
+def _model(model: type[BaseModel], loc: tuple[str | int, ...]) -> type[BaseModel]:
+    """The model at `loc` inside `model`; names of free keys are passed over."""
     for part in loc:
         if str(part) in model.model_fields:
             model = _inner(model.model_fields[str(part)].annotation) or model
-    return list(model.model_fields)
+    return model
+
+
+def settings(model: type[BaseModel]) -> dict[str, FieldInfo]:
+    """The fields of a model by dotted name, those of its blocks in place of each block."""
+    found: dict[str, FieldInfo] = {}
+    for name, field in model.model_fields.items():
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            found |= {join(name, inner): value for inner, value in settings(field.annotation).items()}
+        else:
+            found[name] = field
+    return found
 
 
 def _inner(annotation: Any) -> type[BaseModel] | None:

@@ -1,6 +1,6 @@
 """From which step on a run learns: a budget that ends before leaves the networks as they were drawn.
 
-Off-policy methods wait for the warm-up, on-policy ones for a rollout, HiT-MAC's coordinator for the end of the
+Off-policy methods wait for `learning_starts`, on-policy ones for a rollout, HiT-MAC's coordinator for the end of the
 executors' practice. Steps are environment steps, summed over the parallel copies as everywhere.
 """
 
@@ -29,7 +29,7 @@ def starts(setting: Setting) -> list[Start]:
     if isinstance(algo, OffPolicy):
         return [_warm(algo, copies)]
     assert isinstance(algo, OnPolicy)
-    return [Start(algo.rollout * copies, f"rollout {algo.rollout:,} x num_envs {copies:,}")]
+    return [Start(algo.n_steps * copies, f"n_steps {algo.n_steps:,} x num_envs {copies:,}")]
 
 
 def shortfall(setting: Setting) -> str:
@@ -54,15 +54,15 @@ def _up(steps: int, copies: int) -> int:
 
 
 def _warm(algo: Any, copies: int, updates: int = 1) -> Start:
-    step = _up(algo.warmup + updates * algo.steps_per_update, copies)
-    each = f"steps_per_update {algo.steps_per_update:,}" + (f" x {updates:,}" if updates > 1 else "")
-    return Start(step, f"warmup {algo.warmup:,} + {each}")
+    step = _up(algo.learning_starts + updates * algo.train_freq, copies)
+    each = f"train_freq {algo.train_freq:,}" + (f" x {updates:,}" if updates > 1 else "")
+    return Start(step, f"learning_starts {algo.learning_starts:,} + {each}")
 
 
 def _rhmc(algo: rhmc.Config, copies: int, episode: int) -> list[Start]:
     """Executors learn once a period has ended; the coordinator with some of their updates."""
     ended = copies * min(algo.assignment_period, episode)
-    low, high = _warm(algo, copies), _warm(algo, copies, algo.coordinator_every)
+    low, high = _warm(algo, copies), _warm(algo, copies, algo.coordinator.update_every)
     period = f", and assignment_period {algo.assignment_period:,}" if ended > (low.step or 0) else ""
     return [Start(max(one.step or 0, ended), one.waits + period) for one in dict.fromkeys((low, high))]
 
@@ -73,9 +73,10 @@ def _hitmac(algo: hitmac.Config, copies: int, episode: int) -> list[Start]:
     low = _warm(algo, copies)
     if low.step is None or low.step > practised:
         low = Start(None, f"the executors practise for pretrain {algo.pretrain:,}, and need {low.waits}")
-    waited = _decided(algo.rollout, algo.assignment_period, episode, practised // copies % episode)
-    text = f"pretrain {algo.pretrain:,} + rollout {algo.rollout:,} x assignment_period {algo.assignment_period:,}"
-    return [low, Start(practised + copies * waited, f"{text} x num_envs {copies:,}")]
+    waited = _decided(algo.coordinator.n_steps, algo.assignment_period, episode, practised // copies % episode)
+    decisions = f"coordinator.n_steps {algo.coordinator.n_steps:,} x assignment_period {algo.assignment_period:,}"
+    text = f"pretrain {algo.pretrain:,} + {decisions} x num_envs {copies:,}"
+    return [low, Start(practised + copies * waited, text)]
 
 
 def _decided(decisions: int, period: int, episode: int, begun: int) -> int:

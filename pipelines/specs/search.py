@@ -19,12 +19,16 @@ import hashlib
 import itertools
 import json
 from collections.abc import Iterator, Sequence
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Self, get_args
 
 from pydantic import Field, model_validator
 
-from pipelines.specs.document import Fault, Node, Place, choices, show, validate
+from pipelines.specs import renamed
+from pipelines.specs.document import Fault, Node, Place, choices, join, merge, settings, show, validate
+from pipelines.specs.grid import nested
 from pipelines.specs.identity import code_id
 from pipelines.specs.include import closure
 from pipelines.specs.safe_names import study_name
@@ -141,7 +145,7 @@ class File(Frozen):
 
 
 class Arm(NamedTuple):
-    """One method and its space."""
+    """One method and its space, by dotted name of a setting."""
 
     setting: Setting
     space: dict[str, Dimension]
@@ -152,9 +156,11 @@ class Arm(NamedTuple):
         Raises:
             ValueError: the method has no such setting (a rule across fields).
         """
-        return Setting.model_validate(
-            {"env": self.setting.env, "trainer": self.setting.trainer, "algo": self.setting.algo.model_dump() | params}
-        )
+        algo = self.setting.algo.model_dump()
+        for key, value in params.items():
+            *blocks, name = key.split(".")
+            reduce(getitem, blocks, algo)[name] = value
+        return Setting.model_validate({"env": self.setting.env, "trainer": self.setting.trainer, "algo": algo})
 
     def fixed(self) -> str:
         """The setting as `Setting.stated` has it, without what the space replaces: equal where all trials are."""
@@ -244,10 +250,11 @@ def _arm(node: Node, setting: Setting) -> tuple[Arm, list[Fault]]:
 
 def _dimension(name: str, node: Node, setting: Setting) -> tuple[Dimension | None, list[Fault]]:
     """One entry of a space, its bounds tried out in the method one at a time."""
-    fields = type(setting.algo).model_fields
+    fields = settings(type(setting.algo))
     allowed = [field for field in fields if field != "kind"]
     if name not in allowed:
-        text = f"'{setting.algo.kind}' has no setting {show(name)}; {choices(name, allowed)}"
+        unknown = f"'{setting.algo.kind}' has no setting {show(name)}; {choices(name, allowed)}"
+        text = renamed.hint(name, allowed, dotted=True) or unknown
         return None, [Fault(node.key, node.path, text)]
     dimension, faults = validate(Dimension, node, hidden=("whole",))
     if dimension is None:
@@ -279,14 +286,17 @@ def _extremes(node: Node) -> list[Node]:
 def _tried(setting: Setting, values: dict[str, Node]) -> list[Fault]:
     """What the method says against these values; a fault about a value is at its place."""
     place = next(iter(values.values())).place
-    written = {key: _written(key, value, place) for key, value in setting.algo.model_dump(mode="json").items()}
-    return validate(TABLES["algo"][setting.algo.kind], Node(written | values, place, place, ""))[1]
+    layers = [nested(key.split("."), value) for key, value in values.items()]
+    whole = reduce(merge, layers, _written("", setting.algo.model_dump(mode="json"), place))
+    return validate(TABLES["algo"][setting.algo.kind], whole)[1]
 
 
 def _written(key: str, value: Any, place: Place) -> Node:
     """A value that stands elsewhere as a node at `place`."""
     if isinstance(value, list):
-        value = [_written(f"{key}.{i}", child, place) for i, child in enumerate(value)]
+        value = [_written(join(key, str(i)), child, place) for i, child in enumerate(value)]
+    elif isinstance(value, dict):
+        value = {name: _written(join(key, name), child, place) for name, child in value.items()}
     return Node(value, place, place, key)
 
 

@@ -12,6 +12,7 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from functools import reduce
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any, Generic, Literal, NamedTuple, Self, TypeVar
 
@@ -28,6 +29,7 @@ from pipelines.specs.document import (
     merge,
     override,
     read,
+    settings,
     show,
     validate,
 )
@@ -53,7 +55,7 @@ M = TypeVar("M", bound=BaseModel)
 FIELDS = [  # every dotted name of a run's settings
     f"{section}.{field}"
     for section, configs in (TABLES | {"trainer": {"": trainer.Config}}).items()
-    for field in sorted({name for config in configs.values() for name in config.model_fields})
+    for field in sorted({name for config in configs.values() for name in settings(config)})
 ]
 COMMON = {"env": "observation", "algo": "encoder"}  # what must not differ between methods by oversight
 
@@ -193,8 +195,8 @@ def changes(base: Setting, setting: Setting) -> dict[str, Any]:
         if type(before) is not type(after):
             differs[f"{section}.kind"] = after.kind
             continue
-        names = [name for name in type(after).model_fields if getattr(before, name) != getattr(after, name)]
-        differs |= {f"{section}.{name}": getattr(after, name) for name in names}
+        values = {name: attrgetter(name) for name in settings(type(after))}
+        differs |= {f"{section}.{name}": of(after) for name, of in values.items() if of(before) != of(after)}
     return differs
 
 
@@ -319,13 +321,13 @@ def load_layers(
     file, structure = validate(gridded if gridded and "grid" in root.children else model, root)
     known = root._replace(value={key: child for key, child in root.children.items() if key in model.model_fields})
     variants = _group(known, "variants")
-    settings = {(p, v): _settings(known, p, v, patches) for p in PROFILES for v in (None, *variants)}
+    resolved = {(p, v): _settings(known, p, v, patches) for p in PROFILES for v in (None, *variants)}
     faults += structure + _variant_faults(path, variants, variant)
     # An arm that is wrong in its shape resolves to the base: that it is the same as another is no news then.
-    faults += [f for one in settings.values() for f in one.faults if not (structure and TWIN in f.text)]
+    faults += [f for one in resolved.values() for f in one.faults if not (structure and TWIN in f.text)]
     if file is not None and profile in PROFILES:
         faults += [f for name in counts for f in _no_value(root, name, profile)]
-    return Loaded(file, root, settings.get((profile, variant)) or settings[PROFILES[0], None], faults)
+    return Loaded(file, root, resolved.get((profile, variant)) or resolved[PROFILES[0], None], faults)
 
 
 def _trees(

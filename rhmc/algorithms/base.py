@@ -1,4 +1,4 @@
-"""What the trainer expects of an algorithm, and what the table of algorithms says of each."""
+"""The interface of an algorithm to the trainer, and the table of algorithms."""
 
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple, Protocol

@@ -1,14 +1,15 @@
-"""COMA, counterfactual multi-agent policy gradients: an agent is paid for what its action adds to the team's value.
+"""COMA, counterfactual multi-agent policy gradients: an agent learns from what its action adds to the team's value.
 
 A central critic gives the value of each own action beside what everybody sees and what the others do. An action's
 advantage is its value minus the mean of all own actions' values under the policy: the others' part cancels out.
 
 Source: Foerster et al. 2018, eq. 4 and algorithm 1.
-Departures: an action is held to be worth its lambda-return, as the critic alone tells actions apart too badly (`worth:
-critic` is the source's rule); returns bootstrap with the mean of an agent's own action values, not the sampled one's;
-where a rollout or an episode ends, the others' next actions are drawn from the policy; advantages and returns are
-standardised; an entropy bonus beside the floor of the chances, which is constant; minibatches; feed-forward networks;
-a slow critic by polyak averaging, which also gives the baseline; truncation bootstraps (`trainer.time_limit`).
+Departures: the advantage of an action is that of its lambda-return, as the critic alone tells actions apart too badly
+(`advantage_estimator: critic` is the source's rule); returns bootstrap with the mean of an agent's own action values,
+not the sampled one's; where a rollout or an episode ends, the others' next actions are drawn from the policy;
+advantages and returns are standardised; an entropy bonus beside the floor of the chances, which is constant;
+minibatches; feed-forward networks; a target critic that moves by a share (`tau`), which also gives the baseline;
+truncation bootstraps (`trainer.bootstrap_on_truncation`).
 """
 
 from typing import Literal
@@ -22,9 +23,9 @@ from rhmc.algorithms.base import About, Method, register_method
 from rhmc.learning import checkpoint
 from rhmc.learning.experience import Rollout, ends, flat, minibatches
 from rhmc.learning.learner import Learner, Learners, taken, unpack
-from rhmc.learning.normalisation import Standard
+from rhmc.learning.normalisation import Standardiser
 from rhmc.learning.returns import td_lambda
-from rhmc.learning.settings import OnPolicy, Slow, Standardised
+from rhmc.learning.settings import OnPolicy, Standardised, TargetNetworks
 from rhmc.networks.nets import ENCODERS, Sizes, team
 from rhmc.networks.sampling import mix
 from rhmc.types import Batch, Carry, Obs, Spec, State, Transition
@@ -40,22 +41,22 @@ ABOUT = About(
 )
 
 
-class Config(Slow, Standardised, OnPolicy):
+class Config(TargetNetworks, Standardised, OnPolicy):
     """Settings, found on navigation and coverage; the paper's lr is 5e-4, its gamma 0.99, the source's lambda 0.8."""
 
     kind: Literal["coma"] = "coma"
     lr: float = Field(1e-3, gt=0, description="Adam's step size")
-    polyak: float = Field(0.98, ge=0, le=1, description="share of the slow critic kept per update")
+    tau: float = Field(0.02, ge=0, le=1, description="share of the way that the target critic moves per update")
     gamma: float = Field(0.95, ge=0, le=1)
     standardise: Literal["none", "reward", "return"] = Field(
         "return",
         description="learn from rewards, or predict returns, of mean 0 and deviation 1 (`rhmc.learning.normalisation`)",
     )
-    rollout: int = Field(10, ge=1, description="steps of each environment between updates")
-    entropy: float = Field(0.03, ge=0, description="weight of the policy's entropy")
-    lam: float = Field(0.9, ge=0, le=1, description="lambda of the returns")
-    worth: Literal["critic", "return"] = Field(
-        "return", description="what an action is worth, above the baseline: the critic's value of it, or its return"
+    n_steps: int = Field(10, ge=1, description="steps of each environment between updates")
+    ent_coef: float = Field(0.03, ge=0, description="weight of the policy's entropy")
+    td_lambda: float = Field(0.9, ge=0, le=1, description="lambda of the returns")
+    advantage_estimator: Literal["critic", "return"] = Field(
+        "return", description="value of an action, less the baseline: the critic's value of it, or its lambda-return"
     )
     scale: bool = Field(True, description="give a rollout's advantages mean 0 and deviation 1")
     epochs: int = Field(2, ge=1, description="how often the critic sees a rollout; the actor sees it once")
@@ -70,14 +71,16 @@ class COMA:
     def __init__(self, cfg: Config, spec: Spec, num_envs: int, rng: Generator) -> None:
         self.cfg, self.actions, self.rng = cfg, spec.actions, rng
         sizes, encoder = Sizes.of(spec), ENCODERS[cfg.encoder]
-        actor = team(lambda: encoder.local(sizes, cfg.hidden, spec.actions), spec.agents, share=cfg.share)
+        actor = team(lambda: encoder.local(sizes, cfg.hidden_dim, spec.actions), spec.agents, share=cfg.share)
         critic = team(
-            lambda: encoder.central(sizes, cfg.hidden, spec.actions, joint=spec.actions), spec.agents, share=cfg.share
+            lambda: encoder.central(sizes, cfg.hidden_dim, spec.actions, joint=spec.actions),
+            spec.agents,
+            share=cfg.share,
         )
-        self.actor = Learner(actor.to(rng.device), lr=cfg.lr, polyak=1, clip=cfg.grad_clip)
-        self.critic = Learner(critic.to(rng.device), lr=cfg.lr, polyak=cfg.polyak, clip=cfg.grad_clip)
-        self.standard = Standard(cfg.standardise, rng.device)
-        self.rollout = Rollout(cfg.rollout, rng.device)
+        self.actor = Learner(actor.to(rng.device), lr=cfg.lr, tau=0.0, max_grad_norm=cfg.max_grad_norm)
+        self.critic = Learner(critic.to(rng.device), lr=cfg.lr, tau=cfg.tau, max_grad_norm=cfg.max_grad_norm)
+        self.standardiser = Standardiser(cfg.standardise, rng.device)
+        self.rollout = Rollout(cfg.n_steps, rng.device)
 
     # Acting
 
@@ -100,7 +103,7 @@ class COMA:
 
     def observe(self, transition: Transition) -> None:
         """Keep the step until the rollout is whole."""
-        self.standard.see_rewards(transition.reward)
+        self.standardiser.update_rewards(transition.reward)
         self.rollout.add(transition, chance=transition.extra["chance"])
 
     def update(self) -> Batch:
@@ -109,8 +112,8 @@ class COMA:
         if rollout is None:
             return {}
         target, advantage = self._judged(rollout)
-        self.standard.see_returns(target)
-        rows = flat(rollout | {"target": self.standard.target(target), "advantage": advantage})
+        self.standardiser.update_returns(target)
+        rows = flat(rollout | {"target": self.standardiser.target(target), "advantage": advantage})
         rows = {key: value for key, value in rows.items() if not key.startswith("next_")}
         logs: Batch = {}
         for part in minibatches(rows, self.cfg.epochs, self.cfg.minibatches, self.rng):
@@ -123,26 +126,26 @@ class COMA:
 
     @torch.no_grad()
     def _judged(self, rollout: Batch) -> tuple[Tensor, Tensor]:
-        """The lambda-return of every agent and the advantage of its action by the slow critic, (T, B, N) both."""
+        """The lambda-return of every agent and the advantage of its action by the target critic, (T, B, N) both."""
         rows, shape = flat(rollout), rollout["reward"].shape
         q = self._values(unpack(rows), rows["action"])
         value = expected(q, rows["chance"]).unflatten(0, shape)
         last, after = ends(rollout)
         chance = self._chance(self.actor.net(after))
-        following = torch.cat((value[1:], value[-1:]))
-        following[last] = expected(self._values(after, draw(chance, self.rng)), chance)
-        reward = self.standard.reward(rollout["reward"])
-        reward, terminal, ended = (x.unsqueeze(-1) for x in (reward, rollout["terminal"], rollout["ended"]))
-        target = td_lambda(reward, following, terminal, ended, self.cfg.gamma, self.cfg.lam)
-        worth = {"critic": taken(q, rows["action"]).unflatten(0, shape), "return": target}[self.cfg.worth]
-        advantage = worth - value
+        next_values = torch.cat((value[1:], value[-1:]))
+        next_values[last] = expected(self._values(after, draw(chance, self.rng)), chance)
+        reward = self.standardiser.reward(rollout["reward"])
+        reward, terminated, done = (x.unsqueeze(-1) for x in (reward, rollout["terminated"], rollout["done"]))
+        target = td_lambda(reward, next_values, terminated, done, self.cfg.gamma, self.cfg.td_lambda)
+        estimates = {"critic": taken(q, rows["action"]).unflatten(0, shape), "return": target}
+        advantage = estimates[self.cfg.advantage_estimator] - value
         if self.cfg.scale:
             advantage = (advantage - advantage.mean()) / advantage.std(correction=0).clamp(min=1e-6)
         return target, advantage
 
     def _values(self, obs: Obs, action: Tensor) -> Tensor:
-        """What the slow critic says of every own action beside the others': (B, N, actions)."""
-        return self.standard.value(self.critic.slow(obs, joint=self._joint(action)))
+        """The target critic's values of every own action, given the others' actions: (B, N, actions)."""
+        return self.standardiser.value(self.critic.target_net(obs, joint=self._joint(action)))
 
     def _joint(self, action: Tensor) -> Tensor:
         return one_hot(action, self.actions).float()
@@ -157,7 +160,7 @@ class COMA:
         surprise = -chance.clamp(min=1e-10).log()
         entropy = (chance * surprise).sum(-1).mean()
         gain = (rows["advantage"] * -taken(surprise, rows["action"])).mean()
-        return -gain - self.cfg.entropy * entropy, {"entropy": entropy, "gain": gain}
+        return -gain - self.cfg.ent_coef * entropy, {"entropy": entropy, "gain": gain}
 
     def learners(self) -> Learners:
         """Actor and critic."""
@@ -166,7 +169,7 @@ class COMA:
     # Checkpoints
 
     def _parts(self) -> checkpoint.Parts:
-        return {"actor": self.actor, "critic": self.critic, "rollout": self.rollout, "standard": self.standard}
+        return {"actor": self.actor, "critic": self.critic, "rollout": self.rollout, "standardiser": self.standardiser}
 
     def state_dict(self) -> State:
         """Networks, rollout, statistics and generator."""

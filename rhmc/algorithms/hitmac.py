@@ -1,12 +1,12 @@
 """HiT-MAC: executors learn alone under any assignment and are frozen; then a coordinator learns to assign them.
 
-Source: Xu et al. 2020, section 3: executors paid by the targets assigned to them; a coordinator with attention over all
-pairs, whose critic adds up the pairs' approximate marginal contributions, holds an assignment for 10 steps and learns
-from the team's reward.
+Source: Xu et al. 2020, section 3: executors rewarded for their assigned targets; a coordinator with attention over
+all pairs, whose critic adds up the pairs' approximate marginal contributions, holds an assignment for 10 steps and
+learns from the team's reward.
 Departures: the executors are those of `rhmc.hierarchy.executor` (off-policy, a central critic) instead of A3C, under
 assignments drawn at random (`practice`), within the run's budget (`pretrain`). Synchronous instead of A3C: rollouts of
 all environments, several epochs on each with every pair's ratio of probabilities clipped (`epochs: 1, minibatches: 1`
-is the plain actor-critic), normalised advantages, predicted returns standardised. A period that an episode cuts short
+is the plain actor-critic), normalised advantages, predicted returns standardised. A period that an episode shortens
 counts for the steps it had. A pair's contribution is judged from the mean of those before it, not by attention over
 them; its order is drawn, not fixed. Truncation bootstraps.
 """
@@ -22,7 +22,7 @@ from rhmc.hierarchy import attention, executor
 from rhmc.learning import checkpoint
 from rhmc.learning.experience import Experience
 from rhmc.learning.learner import Learners, Replay, choose, pack
-from rhmc.learning.settings import OffPolicy
+from rhmc.learning.settings import Replayed
 from rhmc.types import Batch, Carry, Obs, Spec, State, Transition
 
 ABOUT = About(
@@ -37,13 +37,17 @@ ABOUT = About(
 PRACTISED = 10  # steps that a random assignment lasts on average
 
 
-class Config(attention.Config, executor.Config, OffPolicy):
+class Executor(executor.Settings):
+    """The block `executor`: actors only."""
+
+    method: Literal["gumbel", "expected"] = Field("expected", description="as in `rhmc.hierarchy.executor`")
+
+
+class Config(attention.Config, executor.Config, Replayed):
     """Settings; those of the coordinator are the source's."""
 
     kind: Literal["hitmac"] = "hitmac"
-    executor: Literal["gumbel", "expected"] = Field(
-        "expected", description="actor's gradient, as in `rhmc.hierarchy.executor`"
-    )
+    executor: Executor = Executor()
     pretrain: int = Field(500_000, ge=0, description="environment steps in which the executors learn")
 
 
@@ -54,12 +58,13 @@ class HiTMAC:
         self.cfg, self.spec, self.rng = cfg, spec, rng
         self.executor = executor.Executor(cfg, spec, rng)
         self.coordinator = attention.Coordinator(cfg, spec, rng)
-        self.practised, self.decisions = Experience(cfg, rng), Decisions(cfg.rollout, rng.device)
+        self.practised = Experience(cfg, cfg.executor.batch_size, rng)
+        self.decisions = Decisions(cfg.coordinator.n_steps, rng.device)
         self.pending: Batch = {}  # the half-done assignment period of each environment
 
     @property
     def practising(self) -> bool:
-        """Whether the executors still learn."""
+        """True while the executors learn."""
         return self.practised.steps < self.cfg.pretrain
 
     # Acting
@@ -93,15 +98,15 @@ class HiTMAC:
         t, extra = transition, transition.extra
         if self.practising:
             return self.practised.add(self.executor.rows(t, extra["assignment"]), len(t.reward))
-        self.coordinator.standard.see_rewards(t.reward)
+        self.coordinator.standardiser.update_rewards(t.reward)
         none = torch.zeros_like(t.reward)
         start = pack(t.obs) | {key: extra[key] for key in ("assignment", "chance")} | {"reward": none, "length": none}
         self.pending = p = choose(extra["new"], start, self.pending or start)
-        p["reward"] = p["reward"] + self.coordinator.standard.reward(t.reward) / self.cfg.assignment_period
+        p["reward"] = p["reward"] + self.coordinator.standardiser.reward(t.reward) / self.cfg.assignment_period
         p["length"] = p["length"] + 1
-        over = t.terminal | t.truncated
-        done = over | (p["length"] >= self.cfg.assignment_period)
-        return self.decisions.add(p | pack(t.next_obs, "next_") | {"terminal": t.terminal, "ended": over}, done)
+        done = t.terminated | t.truncated
+        rows = p | pack(t.next_obs, "next_") | {"terminated": t.terminated, "done": done}
+        return self.decisions.add(rows, done | (p["length"] >= self.cfg.assignment_period))
 
     def update(self) -> Batch:
         """The executors' updates that are due; when they are frozen, all epochs of the coordinator's full rollout."""
@@ -109,7 +114,7 @@ class HiTMAC:
         for rows in self.practised.due():
             logs = self.executor.update(rows)
         if not self.practising:
-            self.practised.replay = Replay(self.cfg.buffer, self.rng)  # of no more use
+            self.practised.replay = Replay(self.cfg.buffer_size, self.rng)  # of no more use
             rollout = self.decisions.take()
             logs |= self.coordinator.learn(rollout) if rollout else {}
         return logs
@@ -142,24 +147,24 @@ class Decisions:
         self.rows: Batch = {}  # (length, B, ...)
         self.count = torch.zeros(0, dtype=torch.int64)  # (B,) assignments kept
 
-    def add(self, rows: Batch, done: Tensor) -> None:
-        """Keep the rows (B, ...) of the environments where `done`."""
-        if not bool(done.any()):
+    def add(self, rows: Batch, over: Tensor) -> None:
+        """Keep the rows (B, ...) of the environments whose period is `over`, (B,) bool."""
+        if not bool(over.any()):
             return
         if not self.rows:
             self.rows = {key: value.new_zeros(self.length, *value.shape) for key, value in rows.items()}
-            self.count = torch.zeros(len(done), dtype=torch.int64, device=self.device)
-        where = done.nonzero().squeeze(1)
+            self.count = torch.zeros(len(over), dtype=torch.int64, device=self.device)
+        where = over.nonzero().squeeze(1)
         for key, value in rows.items():
             self.rows[key][self.count[where], where] = value[where]
-        self.count = self.count + done
+        self.count = self.count + over
 
     def take(self) -> Batch | None:
-        """All rows once an environment has `length`: those `filled` (length, B), the last of each marked `ended`."""
+        """All rows once an environment has `length`: those `filled` (length, B), the last of each marked `done`."""
         if not len(self.count) or int(self.count.max()) < self.length:
             return None
         place = torch.arange(self.length, device=self.device).unsqueeze(1)
-        rows = self.rows | {"filled": place < self.count, "ended": self.rows["ended"] | (place >= self.count - 1)}
+        rows = self.rows | {"filled": place < self.count, "done": self.rows["done"] | (place >= self.count - 1)}
         self.rows, self.count = {}, self.count[:0]
         return rows
 

@@ -3,8 +3,8 @@
 Source: Lowe et al. 2017, eq. 5 and 6 and algorithm 1; the discrete form and its penalty after EPyMARL's benchmark
 (Papoudakis et al. 2021).
 Departures: parameters shared by all agents, told apart by a one-hot id (`share: false` gives each its own);
-feed-forward; a replay of steps; the critics learn from the team's reward; the target's action is the slow actor's best
-one, not a draw; a share of random actions, or Gaussian noise, when exploring; truncation bootstraps. The discrete
+feed-forward; a replay of steps; the critics learn from the team's reward; the target's action is the target actor's
+best one, not a draw; a share of random actions, or Gaussian noise, when exploring; truncation bootstraps. The discrete
 critic has an output for each own action, hence is linear in it: a critic that takes it as input is trained at one-hot
 actions only, and its slope there need not point to the better choice.
 """
@@ -21,8 +21,8 @@ from rhmc.algorithms.base import About, Method, register_method
 from rhmc.learning import checkpoint
 from rhmc.learning.experience import Experience
 from rhmc.learning.learner import Learner, Learners, pack_step, unpack
-from rhmc.learning.normalisation import Standard
-from rhmc.learning.settings import OffPolicy, Slow, Standardised
+from rhmc.learning.normalisation import Standardiser
+from rhmc.learning.settings import OffPolicy, Standardised, TargetNetworks
 from rhmc.networks.heads import Continuous, Discrete, Head
 from rhmc.networks.nets import ENCODERS, Sizes, team
 from rhmc.types import Batch, Carry, Obs, Spec, State, Transition
@@ -39,7 +39,7 @@ ABOUT = About(
 )
 
 
-class Config(Slow, Standardised, OffPolicy):
+class Config(TargetNetworks, Standardised, OffPolicy):
     """Settings; the penalty is EPyMARL's."""
 
     kind: Literal["maddpg"] = "maddpg"
@@ -57,13 +57,13 @@ class MADDPG:
             Continuous(spec.actions, cfg.noise) if spec.continuous else Discrete(spec.actions, cfg.epsilon)
         )
         encoder, sizes = ENCODERS[cfg.encoder], Sizes.of(spec)
-        local = partial(encoder.local, sizes, cfg.hidden, spec.actions)
-        central = partial(self.head.critic, partial(encoder.central, sizes, cfg.hidden, joint=spec.actions))
+        local = partial(encoder.local, sizes, cfg.hidden_dim, spec.actions)
+        central = partial(self.head.critic, partial(encoder.central, sizes, cfg.hidden_dim, joint=spec.actions))
         actor, critic = (team(make, spec.agents, share=cfg.share).to(rng.device) for make in (local, central))
-        self.actor = Learner(actor, lr=cfg.lr, polyak=cfg.polyak, clip=cfg.grad_clip)
-        self.critic = Learner(critic, lr=cfg.lr, polyak=cfg.polyak, clip=cfg.grad_clip)
-        self.standard = Standard(cfg.standardise, rng.device)
-        self.experience = Experience(cfg, rng)
+        self.actor = Learner(actor, lr=cfg.lr, tau=cfg.tau, max_grad_norm=cfg.max_grad_norm)
+        self.critic = Learner(critic, lr=cfg.lr, tau=cfg.tau, max_grad_norm=cfg.max_grad_norm)
+        self.standardiser = Standardiser(cfg.standardise, rng.device)
+        self.experience = Experience(cfg, cfg.batch_size, rng)
 
     # Acting
 
@@ -81,7 +81,7 @@ class MADDPG:
     def observe(self, transition: Transition) -> None:
         """Store one row per environment."""
         t = transition
-        self.standard.see_rewards(t.reward)
+        self.standardiser.update_rewards(t.reward)
         self.experience.add(pack_step(t), len(t.reward))
 
     def update(self) -> Batch:
@@ -95,19 +95,19 @@ class MADDPG:
         return logs
 
     def _critic_loss(self, rows: Batch) -> tuple[Tensor, Batch]:
-        target, taken = self._target(rows), self.head.encode(rows["action"])
+        td_target, taken = self._target(rows), self.head.encode(rows["action"])
         q = self.critic.net(unpack(rows), own=taken, joint=taken).squeeze(-1)
-        self.standard.see_returns(target)
-        loss = mse_loss(q, self.standard.target(target).expand_as(q))
+        self.standardiser.update_returns(td_target)
+        loss = mse_loss(q, self.standardiser.target(td_target).expand_as(q))
         return loss, {"td_loss": loss, "q": q.mean()}
 
     @torch.no_grad()
     def _target(self, rows: Batch) -> Tensor:
         after = unpack(rows, "next_")
-        best = self.head.encode(self.head.greedy(self.actor.slow(after)))
-        value = self.standard.value(self.critic.slow(after, own=best, joint=best).squeeze(-1))
-        live = (~rows["terminal"]).float().unsqueeze(-1)
-        return self.standard.reward(rows["reward"]).unsqueeze(-1) + self.cfg.gamma * live * value
+        best = self.head.encode(self.head.greedy(self.actor.target_net(after)))
+        value = self.standardiser.value(self.critic.target_net(after, own=best, joint=best).squeeze(-1))
+        live = (~rows["terminated"]).float().unsqueeze(-1)
+        return self.standardiser.reward(rows["reward"]).unsqueeze(-1) + self.cfg.gamma * live * value
 
     def _actor_loss(self, rows: Batch) -> tuple[Tensor, Batch]:
         """Each agent's own action from its actor, the others' as they were taken."""
@@ -124,7 +124,7 @@ class MADDPG:
 
     def _parts(self) -> checkpoint.Parts:
         parts = {"actor": self.actor, "critic": self.critic}
-        return parts | {"experience": self.experience, "standard": self.standard}
+        return parts | {"experience": self.experience, "standardiser": self.standardiser}
 
     def state_dict(self) -> State:
         """Networks, replay, statistics and generator."""

@@ -17,7 +17,7 @@ from torch.nn.functional import huber_loss
 from rhmc.learning import checkpoint
 from rhmc.learning.experience import Rollout, flat, minibatches, values
 from rhmc.learning.learner import Learner, Learners, taken, unpack
-from rhmc.learning.normalisation import Standard
+from rhmc.learning.normalisation import Standardiser
 from rhmc.learning.returns import gae, normalised
 from rhmc.learning.settings import Networks, OnPolicy, Standardised
 from rhmc.networks.nets import ENCODERS, Sizes, team
@@ -38,17 +38,19 @@ class Config(Networks, Standardised, OnPolicy):
         "return",
         description="learn from rewards, or predict returns, of mean 0 and deviation 1 (`rhmc.learning.normalisation`)",
     )
-    lam: float = Field(0.95, ge=0, le=1, description="lambda of the advantages")
+    gae_lambda: float = Field(0.95, ge=0, le=1, description="lambda of the advantages")
     epochs: int = Field(10, ge=1, description="passes over a rollout")
     minibatches: int = Field(4, ge=1, description="updates of a pass, each on its share of the rows")
     objective: Literal["clip", "kl_adaptive"] = "clip"
-    clip: float = Field(0.2, gt=0, description="clip: how far the ratio of probabilities may pay to move from 1")
+    clip_range: float = Field(
+        0.2, gt=0, description="clip: distance from 1 at which the ratio of probabilities is clipped"
+    )
     kl_target: float = Field(0.01, gt=0, description="kl_adaptive: divergence of a rollout's updates, in nats")
     huber: float = Field(10.0, gt=0, description="error of the value beyond which its loss is linear")
 
 
 class Objective(Protocol):
-    """What an update is worth: a loss, and what is learned from the divergence after the epochs."""
+    """The objective of an update: a loss, and an adaptation to the divergence after the epochs."""
 
     def __call__(self, new: Tensor, old: Tensor, action: Tensor, advantage: Tensor) -> Tensor:
         """Loss (B, N) of log-policies (B, N, actions), for actions and their advantages (B, N)."""
@@ -60,10 +62,10 @@ class Objective(Protocol):
 
 
 class Clip:
-    """No gain from a ratio further than `clip` from 1 (Schulman et al. 2017, eq. 7)."""
+    """No gain from a ratio further than `clip_range` from 1 (Schulman et al. 2017, eq. 7)."""
 
     def __init__(self, cfg: Config, device: torch.device) -> None:
-        self.low, self.high = 1 - cfg.clip, 1 + cfg.clip
+        self.low, self.high = 1 - cfg.clip_range, 1 + cfg.clip_range
 
     def __call__(self, new: Tensor, old: Tensor, action: Tensor, advantage: Tensor) -> Tensor:
         change = ratio(new, old, action)
@@ -114,14 +116,14 @@ class PPO:
         sizes, encoder = Sizes.of(spec), ENCODERS[cfg.encoder]
 
         def learner(make: Callable[..., nn.Module], out: int, gain: float) -> Learner[nn.Module]:
-            net = team(lambda: orthogonal(make(sizes, cfg.hidden, out), gain), spec.agents, share=cfg.share)
-            return Learner(net.to(rng.device), lr=cfg.lr, polyak=1.0, clip=cfg.grad_clip)
+            net = team(lambda: orthogonal(make(sizes, cfg.hidden_dim, out), gain), spec.agents, share=cfg.share)
+            return Learner(net.to(rng.device), lr=cfg.lr, tau=0.0, max_grad_norm=cfg.max_grad_norm)
 
         self.actor = learner(encoder.local, spec.actions, POLICY_GAIN)
         self.critic = learner(encoder.central if sees == "central" else encoder.local, 1, 1.0)
         self.objective: Objective = OBJECTIVES[cfg.objective](cfg, rng.device)
-        self.standard = Standard(cfg.standardise, rng.device)
-        self.rollout = Rollout(cfg.rollout, rng.device)
+        self.standardiser = Standardiser(cfg.standardise, rng.device)
+        self.rollout = Rollout(cfg.n_steps, rng.device)
 
     # Acting
 
@@ -139,7 +141,7 @@ class PPO:
 
     def observe(self, transition: Transition) -> None:
         """Store one row per environment, with the policy that acted."""
-        self.standard.see_rewards(transition.reward)
+        self.standardiser.update_rewards(transition.reward)
         self.rollout.add(transition, policy=transition.extra["policy"])
 
     def update(self) -> Batch:
@@ -158,14 +160,14 @@ class PPO:
     @torch.no_grad()
     def _judged(self, rows: Batch) -> tuple[Batch, Batch]:
         """Rows (T B, ...) with normalised advantages and the critic's targets, (T B, N) both."""
-        value, following = values(lambda obs: self.standard.value(self._value(obs)), rows)
-        reward = self.standard.reward(rows["reward"]).unsqueeze(-1)  # the team's, to every agent
-        terminal, ended = rows["terminal"].unsqueeze(-1), rows["ended"].unsqueeze(-1)
-        advantage = gae(reward, value, following, terminal, ended, self.cfg.gamma, self.cfg.lam)
+        value, next_values = values(lambda obs: self.standardiser.value(self._value(obs)), rows)
+        reward = self.standardiser.reward(rows["reward"]).unsqueeze(-1)  # the team's, to every agent
+        terminated, done = rows["terminated"].unsqueeze(-1), rows["done"].unsqueeze(-1)
+        advantage = gae(reward, value, next_values, terminated, done, self.cfg.gamma, self.cfg.gae_lambda)
         target = value + advantage
-        self.standard.see_returns(target)
+        self.standardiser.update_returns(target)
         kept = {key: rows[key] for key in ("agents", "pairs", "peers", "action", "policy")}
-        kept |= {"advantage": normalised(advantage), "target": self.standard.target(target)}
+        kept |= {"advantage": normalised(advantage), "target": self.standardiser.target(target)}
         return flat(kept), {"value": value.mean(), "explained": 1 - advantage.var() / target.var()}
 
     def _minibatches(self, rows: Batch) -> Iterable[Batch]:
@@ -178,7 +180,7 @@ class PPO:
         policy = self._policy(unpack(rows))
         loss = self.objective(policy, rows["policy"], rows["action"], rows["advantage"]).mean()
         entropy = -(policy.exp() * policy).sum(-1).mean()
-        norm = self.actor.update(loss - self.cfg.entropy * entropy)
+        norm = self.actor.update(loss - self.cfg.ent_coef * entropy)
         return {"policy_loss": loss, "entropy": entropy, "grad_norm": norm}
 
     def _learn_value(self, rows: Batch) -> Batch:
@@ -190,7 +192,7 @@ class PPO:
         return self.actor.net(obs).log_softmax(-1)
 
     def _value(self, obs: Obs) -> Tensor:
-        """What the critic puts out for each agent, in the scale of its targets: (B, N)."""
+        """Output of the critic for each agent, on the scale of its targets: (B, N)."""
         return self.critic.net(obs).squeeze(-1)
 
     def learners(self) -> Learners:
@@ -201,7 +203,7 @@ class PPO:
 
     def _parts(self) -> checkpoint.Parts:
         learners = {"actor": self.actor, "critic": self.critic}
-        return learners | {"rollout": self.rollout, "standard": self.standard, "objective": self.objective}
+        return learners | {"rollout": self.rollout, "standardiser": self.standardiser, "objective": self.objective}
 
     def state_dict(self) -> State:
         """Networks, rollout, statistics, price and generator."""
@@ -223,7 +225,7 @@ def orthogonal(net: nn.Module, gain: float) -> nn.Module:
 
 
 def ratio(new: Tensor, old: Tensor, action: Tensor) -> Tensor:
-    """How much likelier an action (B, N) has become, from log-policies (B, N, actions): (B, N)."""
+    """Ratio of the new to the old probability of an action (B, N), from log-policies (B, N, actions): (B, N)."""
     return (taken(new, action) - taken(old, action)).exp()
 
 

@@ -2,7 +2,7 @@
 
 The mixer turns the values of the chosen actions, (B, N), into (B, K) values that are learned towards the team's reward:
 itself (IQL, K = N), their sum (VDN, K = 1), a monotone function of them (QMIX, K = 1). Double Q: the network chooses
-the next action, its slow copy values it.
+the next action, the target network values it.
 """
 
 import torch
@@ -13,17 +13,17 @@ from torch.nn.functional import mse_loss
 from rhmc.learning import checkpoint
 from rhmc.learning.experience import Experience
 from rhmc.learning.learner import Learner, Learners, pack_step, taken, unpack
-from rhmc.learning.normalisation import Standard
+from rhmc.learning.normalisation import Standardiser
 from rhmc.learning.schedules import linear
-from rhmc.learning.settings import OffPolicy, Slow, Standardised
+from rhmc.learning.settings import OffPolicy, Standardised, TargetNetworks
 from rhmc.networks.nets import ENCODERS, Sizes, team
 from rhmc.types import Batch, Carry, Obs, Spec, State, Transition
 
 
-class Config(Slow, Standardised, OffPolicy):
+class Config(TargetNetworks, Standardised, OffPolicy):
     """Settings; lr and gamma are the paper's."""
 
-    double: bool = Field(True, description="double Q; false: the slow copy chooses too")
+    double_q: bool = Field(True, description="double Q; false: the target network chooses too")
     epsilon_end: float = Field(0.05, ge=0, le=1)
     epsilon_steps: int = Field(50_000, ge=1)
 
@@ -49,10 +49,10 @@ class QLearning:
     def __init__(self, cfg: Config, spec: Spec, rng: Generator, mixer: nn.Module) -> None:
         self.cfg, self.spec, self.rng = cfg, spec, rng
         sizes, encoder = Sizes.of(spec), ENCODERS[cfg.encoder]
-        agents = team(lambda: encoder.local(sizes, cfg.hidden, spec.actions), spec.agents, share=cfg.share)
-        self.q = Learner(Values(agents, mixer).to(rng.device), lr=cfg.lr, polyak=cfg.polyak, clip=cfg.grad_clip)
-        self.standard = Standard(cfg.standardise, rng.device)
-        self.experience = Experience(cfg, rng)
+        agents = team(lambda: encoder.local(sizes, cfg.hidden_dim, spec.actions), spec.agents, share=cfg.share)
+        self.q = Learner(Values(agents, mixer).to(rng.device), lr=cfg.lr, tau=cfg.tau, max_grad_norm=cfg.max_grad_norm)
+        self.standardiser = Standardiser(cfg.standardise, rng.device)
+        self.experience = Experience(cfg, cfg.batch_size, rng)
 
     # Acting
 
@@ -75,7 +75,7 @@ class QLearning:
     def observe(self, transition: Transition) -> None:
         """Store one row per environment."""
         t = transition
-        self.standard.see_rewards(t.reward)
+        self.standardiser.update_rewards(t.reward)
         self.experience.add(pack_step(t), len(t.reward))
 
     def update(self) -> Batch:
@@ -90,12 +90,12 @@ class QLearning:
         chosen = self.q.net.mixed(unpack(rows), rows["action"])
         with torch.no_grad():
             after = unpack(rows, "next_")
-            best = (self.q.net if self.cfg.double else self.q.slow)(after).argmax(-1)
-            value = self.standard.value(self.q.slow.mixed(after, best))
-            live = (~rows["terminal"]).float().unsqueeze(-1)
-            target = self.standard.reward(rows["reward"]).unsqueeze(-1) + self.cfg.gamma * live * value
-            self.standard.see_returns(target)
-        loss = mse_loss(chosen, self.standard.target(target).expand_as(chosen))
+            best = (self.q.net if self.cfg.double_q else self.q.target_net)(after).argmax(-1)
+            value = self.standardiser.value(self.q.target_net.mixed(after, best))
+            live = (~rows["terminated"]).float().unsqueeze(-1)
+            td_target = self.standardiser.reward(rows["reward"]).unsqueeze(-1) + self.cfg.gamma * live * value
+            self.standardiser.update_returns(td_target)
+        loss = mse_loss(chosen, self.standardiser.target(td_target).expand_as(chosen))
         return loss, {"td_loss": loss, "q": chosen.mean()}
 
     def learners(self) -> Learners:
@@ -105,7 +105,7 @@ class QLearning:
     # Checkpoints
 
     def _parts(self) -> checkpoint.Parts:
-        return {"q": self.q, "experience": self.experience, "standard": self.standard}
+        return {"q": self.q, "experience": self.experience, "standardiser": self.standardiser}
 
     def state_dict(self) -> State:
         """Network, replay, statistics and generator."""

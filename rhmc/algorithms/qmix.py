@@ -2,7 +2,7 @@
 
 Source: Rashid et al. 2018, figure 2 and section 4; sizes and defaults after EPyMARL's benchmark (Papoudakis et al.
 2021) and the RHMC text, section 5.1.
-Departures: as in `iql` (feed-forward, replay of steps, double Q, slow target by polyak averaging, truncation
+Departures: as in `iql` (feed-forward, replay of steps, double Q, target network moved by a share (`tau`), truncation
 bootstraps), Adam instead of RMSprop; the state is what all agents observe; with the pairwise encoder the weights on an
 agent's value come from its own embedding (`PairwiseMixer`), so that they fit any number of agents.
 """
@@ -32,12 +32,12 @@ class Config(qlearning.Config):
     """Settings; lr and gamma are the paper's, the mixer's size its source's."""
 
     kind: Literal["qmix"] = "qmix"
-    embed: int = Field(32, ge=1, description="units of the mixer's hidden layer")
+    mixing_embed_dim: int = Field(32, ge=1, description="units of the mixer's hidden layer")
 
 
 def build(cfg: Config, spec: Spec, num_envs: int, rng: Generator) -> qlearning.QLearning:
     """The learner."""
-    mixer = ENCODERS[cfg.encoder].mixer(Sizes.of(spec), cfg.hidden, cfg.embed)
+    mixer = ENCODERS[cfg.encoder].mixer(Sizes.of(spec), cfg.hidden_dim, cfg.mixing_embed_dim)
     return qlearning.QLearning(cfg, spec, rng, mixer)
 
 

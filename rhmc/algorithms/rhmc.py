@@ -2,10 +2,10 @@
 
 Source: the RHMC paper, Eq. 6 to 13 and Algorithms 1 and 2; the levels are `rhmc.hierarchy.coordinator` and
 `rhmc.hierarchy.executor`.
-Departures, each a field of `Config`: `coordinator: counterfactual` and `executor: expected` beside the paper's
-gradients; `executor: mixed` instead of actors (`rhmc.hierarchy.mixing_executor`); `regulator: exact` beside Algorithm
-1, with a `horizon`; an assignment may be held (`assignment_period`); both levels may learn from the team's reward
-(`high_reward`, `low_reward`), each on a scale of its own (`standardise_h`, `standardise_l`).
+Departures, each a field of `Config`: `coordinator.gradient: counterfactual` and `executor.method: expected` beside the
+paper's gradients; `executor.method: qmix` instead of actors (`rhmc.hierarchy.mixing_executor`); `regulator: exact`
+beside Algorithm 1, with a `horizon`; an assignment may be held (`assignment_period`); both levels may learn from the
+team's reward (`reward` of either block), each on a scale of its own (`standardise`).
 Eq. 7, 11 and 13 are read with standard signs; truncation bootstraps.
 """
 
@@ -17,12 +17,12 @@ from torch import Generator, Tensor
 
 from rhmc.algorithms.base import About, Method, register_method
 from rhmc.hierarchy import coordinator, executor
-from rhmc.hierarchy import mixing_executor as mixed
+from rhmc.hierarchy.mixing_executor import QMIXExecutor
 from rhmc.hierarchy.regulation import REGULATORS, executed
 from rhmc.learning import checkpoint
 from rhmc.learning.experience import Experience
 from rhmc.learning.learner import Learners, Replay, choose, pack
-from rhmc.learning.settings import OffPolicy
+from rhmc.learning.settings import Replayed
 from rhmc.types import Batch, Carry, Obs, Spec, State, Transition
 
 ABOUT = About(
@@ -36,23 +36,20 @@ ABOUT = About(
 )
 
 
-class Config(coordinator.Config, executor.Config, OffPolicy):
+class Config(coordinator.Config, executor.Config, Replayed):
     """Settings; those that the text gives (lr, gammas, Algorithms 1 and 2 to the letter) are the defaults."""
 
     kind: Literal["rhmc"] = "rhmc"
     regulator: Literal["none", "paper", "exact"] = "paper"
     horizon: int = Field(1, ge=1, description="steps that the regulator lets an agent act")
     alpha: float = Field(0.1, ge=0, le=1, description="alpha_1 of Eq. 6")
-    high_reward: Literal["assigned", "team"] = Field(
-        "assigned", description="what the coordinator is paid: Eq. 6, or the team's reward, which knows no regulation"
-    )
     assignment_period: int = Field(1, ge=1, description="steps for which an assignment is held")
-    coordinator_every: int = Field(1, ge=1, description="updates of the executors for each one of the coordinator")
 
     @model_validator(mode="after")
     def _regulates(self) -> Self:
-        if self.high_reward == "team" and self.regulator != "none":
-            raise ValueError(f"regulator: '{self.regulator}' bounds Eq. 6; with high_reward 'team' allowed: 'none'")
+        if self.coordinator.reward == "team" and self.regulator != "none":
+            text = f"'{self.regulator}' bounds Eq. 6; with coordinator.reward 'team' allowed: 'none'"
+            raise ValueError(f"regulator: {text}")
         return self
 
 
@@ -61,10 +58,11 @@ class RHMC:
 
     def __init__(self, cfg: Config, spec: Spec, num_envs: int, rng: Generator) -> None:
         self.cfg, self.spec, self.rng = cfg, spec, rng
-        self.regulate, self.paid = REGULATORS[cfg.regulator], PAID[cfg.high_reward]
+        self.regulate, self.reward_fn = REGULATORS[cfg.regulator], REWARDS[cfg.coordinator.reward]
         self.coordinator = coordinator.Coordinator(cfg, spec, rng)
-        self.executor = EXECUTORS[cfg.executor](cfg, spec, rng)
-        self.low, self.high = Experience(cfg, rng), Replay(cfg.buffer, rng)
+        self.executor = EXECUTORS[cfg.executor.method](cfg, spec, rng)
+        self.low = Experience(cfg, cfg.executor.batch_size, rng)
+        self.high = Replay(cfg.buffer_size, rng)
         self.pending: Batch = {}  # the half-done assignment period of each environment
 
     # Acting
@@ -98,11 +96,11 @@ class RHMC:
             start["bound"] = self.regulate(t.options(cfg.horizon), g, cfg.alpha)
             self.pending = choose(t.extra["new"], start, self.pending or start)
         p = self.pending = dict(self.pending)
-        p["earned"] = p["earned"] + self.paid(t, g, cfg.alpha)
+        p["earned"] = p["earned"] + self.reward_fn(t, g, cfg.alpha)
         p["length"] = p["length"] + 1
-        ended = t.terminal | t.truncated | (p["length"] >= cfg.assignment_period)
-        rows = {key: value[ended] for key, value in self._period(t).items()}
-        self.coordinator.standard.see_rewards(rows["reward"])
+        over = t.terminated | t.truncated | (p["length"] >= cfg.assignment_period)
+        rows = {key: value[over] for key, value in self._period(t).items()}
+        self.coordinator.standardiser.update_rewards(rows["reward"])
         self.high.add(rows)
 
     def _period(self, t: Transition) -> Batch:
@@ -110,18 +108,18 @@ class RHMC:
         p = self.pending
         rows = {key: p[key] for key in ("agents", "pairs", "peers", "assignment")} | pack(t.next_obs, "next_")
         earned = p["earned"] / p["length"]
-        return rows | {"reward": torch.maximum(earned, p["bound"]), "earned": earned, "terminal": t.terminal}
+        return rows | {"reward": torch.maximum(earned, p["bound"]), "earned": earned, "terminated": t.terminated}
 
     def update(self) -> Batch:
-        """One update of the executors for every `steps_per_update` steps since the warm-up, once a period has ended.
+        """One update of the executors for every `train_freq` steps since `learning_starts`, once a period has ended.
 
-        Every `coordinator_every` of them, one of the coordinator.
+        The coordinator has one update for every `coordinator.update_every` of these.
         """
         logs: Batch = {}
         for rows in self.low.due() if self.high.size else ():
             logs |= self.executor.update(rows)
-            if self.low.updates % self.cfg.coordinator_every == 0:
-                logs |= self.coordinator.update(self.high.sample(self.cfg.batch_h))
+            if self.low.updates % self.cfg.coordinator.update_every == 0:
+                logs |= self.coordinator.update(self.high.sample(self.cfg.coordinator.batch_size))
         return logs
 
     def learners(self) -> Learners:
@@ -152,12 +150,12 @@ def _team(t: Transition, assignment: Tensor, alpha: float) -> Tensor:
     return t.reward
 
 
-EXECUTORS: dict[str, type[executor.Executor | mixed.MixedExecutor]] = {
+EXECUTORS: dict[str, type[executor.Executor | QMIXExecutor]] = {
     "gumbel": executor.Executor,
     "expected": executor.Executor,
-    "mixed": mixed.MixedExecutor,
+    "qmix": QMIXExecutor,
 }
-PAID = {"assigned": _assigned, "team": _team}
+REWARDS = {"assigned": _assigned, "team": _team}
 
 
 register_method("rhmc", Method(Config, RHMC, ABOUT))

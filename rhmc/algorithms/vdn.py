@@ -1,8 +1,8 @@
 """VDN, value decomposition: the team's value is the sum of the agents' values.
 
 Source: Sunehag et al. 2018; defaults after EPyMARL's benchmark (Papoudakis et al. 2021) and the RHMC text, section 5.1.
-Departures: as in `iql` (feed-forward, replay of steps, double Q, slow target by polyak averaging, truncation
-bootstraps).
+Departures: as in `iql` (feed-forward, replay of steps, double Q, target network moved by a share (`tau`),
+truncation bootstraps).
 """
 
 from typing import Literal

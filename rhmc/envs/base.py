@@ -14,7 +14,7 @@ S = TypeVar("S", bound=tuple[Tensor, ...])
 
 
 class Outcome(NamedTuple):
-    """What a step earns: shapes as in `Step`."""
+    """Rewards of a step; shapes as in `Step`."""
 
     reward: Tensor
     local: Local
@@ -45,7 +45,7 @@ class Physics(Protocol):
 
 
 class EnvConfig(Frozen):
-    """What the configuration of every task has; a task adds its own fields."""
+    """Fields that every task's configuration has; a task adds its own."""
 
     kind: str
     agents: int
@@ -106,8 +106,8 @@ class Env:
             state = where(truncated, self.physics.initial(self.cfg, self.batch, self.rng), state)
             obs = self.physics.observe(self.cfg, state)
         self.state = state
-        terminal = torch.zeros_like(truncated)
-        return Step(obs, final_obs, out.reward, out.local, out.completed, terminal, truncated, out.info)
+        terminated = torch.zeros_like(truncated)
+        return Step(obs, final_obs, out.reward, out.local, out.completed, terminated, truncated, out.info)
 
     def options(self) -> Callable[[int], Tensor]:
         """The regulator's table from the present state, as a function of its horizon: (B, N, D, M) bool."""

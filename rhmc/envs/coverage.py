@@ -32,7 +32,7 @@ BOXES = (  # x0, x1, y0, y1 of each sensor's start
 
 
 class Dynamics(NamedTuple):
-    """What a preset fixes."""
+    """Settings that a preset fixes."""
 
     dt: float
     extra_move_every: int  # targets move twice at every such step; 0 = never
@@ -168,7 +168,7 @@ def relation(state: State) -> tuple[Tensor, Tensor]:
 
 
 def visible(bearing: Tensor, distance: Tensor) -> Tensor:
-    """Whether a target at this relative bearing and distance is seen: strict in angle, inclusive in range."""
+    """True where a target at this relative bearing and distance is seen: strict in angle, inclusive in range."""
     return (bearing.abs() < HALF_VIEW) & (distance <= RANGE)
 
 

@@ -5,8 +5,6 @@ every pair a logit. `Contributions` values a state as the sum of what each pair 
 after the Shapley value: one pass over the pairs for any order, by running sums.
 """
 
-from typing import Literal
-
 import torch
 from pydantic import Field
 from torch import Generator, Tensor, nn
@@ -15,26 +13,33 @@ from torch.nn.functional import logsigmoid, mse_loss, scaled_dot_product_attenti
 from rhmc.learning import checkpoint
 from rhmc.learning.experience import flat, minibatches, values
 from rhmc.learning.learner import Learner, Learners, unpack
-from rhmc.learning.normalisation import Standard
+from rhmc.learning.normalisation import Scale, Standardiser
 from rhmc.learning.returns import gae, normalised
-from rhmc.learning.settings import Networks, OnPolicy, Standardised
+from rhmc.learning.settings import Networks
 from rhmc.networks.linear import Linear
 from rhmc.networks.nets import ENCODERS, EncoderName, Sizes, mlp
 from rhmc.networks.sampling import bernoulli
-from rhmc.types import Batch, Obs, Spec, State
+from rhmc.types import Batch, Frozen, Obs, Spec, State
 
 
-class Config(Networks, Standardised, OnPolicy):
-    """Settings of the high level; gamma, lam, entropy, rollout, period and lr are the source's."""
+class Settings(Frozen):
+    """The block `coordinator`; gamma, gae_lambda, ent_coef and n_steps are the source's."""
 
-    assignment_period: int = Field(10, ge=1, description="steps for which an assignment is held")
     gamma: float = Field(0.9, ge=0, le=1, description="per assignment period")
-    lam: float = Field(1.0, ge=0, le=1, description="lambda of the advantages")
-    standardise: Literal["none", "reward", "return"] = "return"
-    rollout: int = Field(20, ge=1, description="assignments in each environment between updates")
+    gae_lambda: float = Field(1.0, ge=0, le=1, description="lambda of the advantages")
+    standardise: Scale = Field("return", description="as `standardise` of other methods")
+    ent_coef: float = Field(0.01, ge=0, description="weight of the policy's entropy")
+    n_steps: int = Field(20, ge=1, description="assignments in each environment between updates")
     epochs: int = Field(6, ge=1, description="passes over a rollout")
     minibatches: int = Field(4, ge=1, description="updates of a pass, each on its share of the rows")
-    clip: float = Field(0.2, gt=0, description="how far a pair's ratio of probabilities may pay to move from 1")
+    clip_range: float = Field(0.2, gt=0, description="clip a pair's ratio of probabilities at this distance from 1")
+
+
+class Config(Networks):
+    """Settings of a method with this coordinator; period and lr are the source's."""
+
+    assignment_period: int = Field(10, ge=1, description="steps for which an assignment is held")
+    coordinator: Settings = Settings()
 
 
 class Attended(nn.Module):
@@ -73,7 +78,7 @@ class Contributions(nn.Module):
         return self.each(self.body(obs), order).sum(1)
 
     def each(self, pairs: Tensor, order: Tensor) -> Tensor:
-        """What each pair adds, from itself and the mean of those before it (zeros for the first).
+        """The contribution of each pair, from itself and the mean of those before it (zeros for the first).
 
         Args:
             pairs: (B, P, H) embeddings.
@@ -92,12 +97,12 @@ class Coordinator:
     """Policy and critic, learned from rollouts of decisions. Assignments are (B, N, M) float, 0 or 1."""
 
     def __init__(self, cfg: Config, spec: Spec, rng: Generator) -> None:
-        self.cfg, self.rng = cfg, rng
+        self.cfg, self.period, self.rng = cfg.coordinator, cfg.assignment_period, rng
         sizes = Sizes.of(spec)
-        actor, critic = (net(cfg.encoder, sizes, cfg.hidden).to(rng.device) for net in (Assigner, Contributions))
-        self.actor = Learner(actor, lr=cfg.lr, polyak=1.0, clip=cfg.grad_clip)
-        self.critic = Learner(critic, lr=cfg.lr, polyak=1.0, clip=cfg.grad_clip)
-        self.standard = Standard(cfg.standardise, rng.device)
+        actor, critic = (net(cfg.encoder, sizes, cfg.hidden_dim).to(rng.device) for net in (Assigner, Contributions))
+        self.actor = Learner(actor, lr=cfg.lr, tau=0.0, max_grad_norm=cfg.max_grad_norm)
+        self.critic = Learner(critic, lr=cfg.lr, tau=0.0, max_grad_norm=cfg.max_grad_norm)
+        self.standardiser = Standardiser(self.cfg.standardise, rng.device)
 
     def assign(self, obs: Obs, rng: Generator, *, explore: bool) -> tuple[Tensor, Tensor]:
         """Assignment, drawn from the policy or its threshold at 1/2, and the log-likelihood of each pair in it."""
@@ -116,27 +121,28 @@ class Coordinator:
     def judge(self, rows: Batch) -> Batch:
         """The decisions of a rollout (K, ...), each with its normalised advantage and the critic's target.
 
-        What follows a period that was cut short is discounted by its share of a whole one.
+        The value after a period that an episode's end shortened is discounted by the period's share of a whole one.
         """
-        value, following = values(lambda obs: self.standard.value(self._output(obs)), rows)
-        following = following * self.cfg.gamma ** (rows["length"] / self.cfg.assignment_period - 1)
-        advantage = gae(rows["reward"], value, following, rows["terminal"], rows["ended"], self.cfg.gamma, self.cfg.lam)
+        value, next_values = values(lambda obs: self.standardiser.value(self._output(obs)), rows)
+        next_values = next_values * self.cfg.gamma ** (rows["length"] / self.period - 1)
+        flags = rows["terminated"], rows["done"]
+        advantage = gae(rows["reward"], value, next_values, *flags, self.cfg.gamma, self.cfg.gae_lambda)
         data = flat(rows | {"advantage": advantage, "target": value + advantage})
         data = {key: value[data["filled"]] for key, value in data.items()}
-        self.standard.see_returns(data["target"])
-        return data | {"advantage": normalised(data["advantage"]), "target": self.standard.target(data["target"])}
+        self.standardiser.update_returns(data["target"])
+        return data | {"advantage": normalised(data["advantage"]), "target": self.standardiser.target(data["target"])}
 
     def improve(self, rows: Batch) -> Batch:
-        """One step of the critic and one of the actor; no gain from a pair's ratio further than `clip` from 1."""
+        """One step of the critic and one of the actor; no gain from a pair's ratio further than `clip_range` from 1."""
         obs, advantage = unpack(rows), rows["advantage"].view(-1, 1, 1)
         error = mse_loss(self._output(obs), rows["target"])
         logits = self.actor.net(obs)
         ratio = (likelihood(logits, rows["assignment"]) - rows["chance"]).exp()
-        clipped = ratio.clamp(1 - self.cfg.clip, 1 + self.cfg.clip)
+        clipped = ratio.clamp(1 - self.cfg.clip_range, 1 + self.cfg.clip_range)
         gain = torch.minimum(ratio * advantage, clipped * advantage).mean()
         entropy = (softplus(logits) - logits * logits.sigmoid()).mean()
         self.critic.update(error)
-        norm = self.actor.update(-gain - self.cfg.entropy * entropy)
+        norm = self.actor.update(-gain - self.cfg.ent_coef * entropy)
         logs = {"value_loss": error, "policy_gain": gain, "entropy": entropy, "grad_norm": norm}
         return logs | {"assigned": rows["assignment"].sum((1, 2)).mean()}
 
@@ -149,7 +155,7 @@ class Coordinator:
         return [self.actor, self.critic]
 
     def _parts(self) -> checkpoint.Parts:
-        return {"actor": self.actor, "critic": self.critic, "standard": self.standard}
+        return {"actor": self.actor, "critic": self.critic, "standardiser": self.standardiser}
 
     def state_dict(self) -> State:
         """Networks and statistics; the generator belongs to its owner."""

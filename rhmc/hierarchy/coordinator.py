@@ -14,55 +14,65 @@ from torch.nn.functional import mse_loss, softplus
 
 from rhmc.learning import checkpoint
 from rhmc.learning.learner import Learner, Learners, unpack
-from rhmc.learning.normalisation import Scale, Standard
-from rhmc.learning.settings import Slow
+from rhmc.learning.normalisation import Scale, Standardiser
+from rhmc.learning.settings import TargetNetworks
 from rhmc.networks.nets import ENCODERS, PairNet, Sizes, append
 from rhmc.networks.sampling import bernoulli, mix, relaxed_bernoulli
-from rhmc.types import Batch, Obs, Spec, State
+from rhmc.types import Batch, Frozen, Obs, Spec, State
 
 
-class Config(Slow):
-    """Settings of the high level; lr and gamma are the paper's."""
+class Settings(Frozen):
+    """The block `coordinator`; gamma is the paper's."""
 
-    coordinator: Literal["ddpg", "counterfactual"] = "ddpg"
-    entropy: float = Field(0.2, ge=0, description="weight of the assignment's entropy, for advantages of deviation 1")
-    gamma_h: float = Field(0.99, ge=0, le=1, description="per assignment period")
-    standardise_h: Scale = Field("none", description="as `standardise` of other methods, for the coordinator")
-    flip: float = Field(0.05, ge=0, le=1, description="share of pairs assigned at random while exploring")
-    batch_h: int = Field(256, ge=1, description="rows of an update")
+    gradient: Literal["ddpg", "counterfactual"] = Field("ddpg", description="gradient of the assignment policy")
+    reward: Literal["assigned", "team"] = Field(
+        "assigned", description="reward of the coordinator: Eq. 6, or the team's reward, which knows no regulation"
+    )
+    gamma: float = Field(0.99, ge=0, le=1, description="per assignment period")
+    standardise: Scale = Field("none", description="as `standardise` of other methods")
+    ent_coef: float = Field(0.2, ge=0, description="weight of the assignment's entropy, for advantages of deviation 1")
+    assignment_epsilon: float = Field(0.05, ge=0, le=1, description="share of pairs assigned at random while exploring")
+    batch_size: int = Field(256, ge=1, description="rows of an update")
+    update_every: int = Field(1, ge=1, description="updates of the executors for each one of the coordinator")
+
+
+class Config(TargetNetworks):
+    """Settings of a method with this coordinator; lr is the paper's."""
+
+    coordinator: Settings = Settings()
 
 
 class Coordinator:
     """Actor over all pairs and the critic of an assignment. Assignments are (B, N, M) float, 0 or 1."""
 
     def __init__(self, cfg: Config, spec: Spec, rng: Generator) -> None:
-        self.cfg, self.rng = cfg, rng
-        self.gain = {"ddpg": self._slope, "counterfactual": self._difference}[cfg.coordinator]
+        self.cfg, self.rng = cfg.coordinator, rng
+        self.gain = {"ddpg": self._slope, "counterfactual": self._difference}[self.cfg.gradient]
         encoder = ENCODERS[cfg.encoder]
-        actor = encoder.pairs(Sizes.of(spec), cfg.hidden, 1).to(rng.device)
-        critic = encoder.pairs(Sizes.of(spec, pair=1), cfg.hidden, 1).to(rng.device)
-        self.actor = Learner(actor, lr=cfg.lr, polyak=cfg.polyak, clip=cfg.grad_clip)
-        self.critic = Learner(critic, lr=cfg.lr, polyak=cfg.polyak, clip=cfg.grad_clip)
-        self.standard = Standard(cfg.standardise_h, rng.device)
+        actor = encoder.pairs(Sizes.of(spec), cfg.hidden_dim, 1).to(rng.device)
+        critic = encoder.pairs(Sizes.of(spec, pair=1), cfg.hidden_dim, 1).to(rng.device)
+        self.actor = Learner(actor, lr=cfg.lr, tau=cfg.tau, max_grad_norm=cfg.max_grad_norm)
+        self.critic = Learner(critic, lr=cfg.lr, tau=cfg.tau, max_grad_norm=cfg.max_grad_norm)
+        self.standardiser = Standardiser(self.cfg.standardise, rng.device)
 
     def assign(self, obs: Obs, rng: Generator, *, explore: bool) -> Tensor:
         """Assignment (B, N, M): drawn from the softened policy, or its threshold at 1/2."""
         logits = self.actor.net(obs).squeeze(-1)
         if explore:
-            return bernoulli(mix(logits.sigmoid(), 0.5, self.cfg.flip), rng)
+            return bernoulli(mix(logits.sigmoid(), 0.5, self.cfg.assignment_epsilon), rng)
         return (logits > 0).float()
 
     def update(self, rows: Batch) -> Batch:
         """One step of the critic (Eq. 7) and one of the actor (Eq. 9)."""
         obs, after = unpack(rows), unpack(rows, "next_")
         with torch.no_grad():
-            best = (self.actor.slow(after).squeeze(-1) > 0).float()
-            live = (~rows["terminal"]).float()
-            value = self.standard.value(worth(self.critic.slow, after, best))
-            target = self.standard.reward(rows["reward"]) + self.cfg.gamma_h * live * value
-            self.standard.see_returns(target)
-        q = worth(self.critic.net, obs, rows["assignment"])
-        td = mse_loss(q, self.standard.target(target))
+            best = (self.actor.target_net(after).squeeze(-1) > 0).float()
+            live = (~rows["terminated"]).float()
+            value = self.standardiser.value(assignment_value(self.critic.target_net, after, best))
+            td_target = self.standardiser.reward(rows["reward"]) + self.cfg.gamma * live * value
+            self.standardiser.update_returns(td_target)
+        q = assignment_value(self.critic.net, obs, rows["assignment"])
+        td = mse_loss(q, self.standardiser.target(td_target))
         self.critic.update(td)
         logits = self.actor.net(obs).squeeze(-1)
         self.actor.update(-self.gain(obs, logits))
@@ -71,7 +81,7 @@ class Coordinator:
         return logs | {"regulated": rows["reward"].mean()}
 
     def _slope(self, obs: Obs, logits: Tensor) -> Tensor:
-        return worth(self.critic.net, obs, relaxed_bernoulli(logits, self.rng)).mean()
+        return assignment_value(self.critic.net, obs, relaxed_bernoulli(logits, self.rng)).mean()
 
     def _difference(self, obs: Obs, logits: Tensor) -> Tensor:
         """Expected advantage of the Bernoulli chances plus entropy; advantages scaled to deviation 1."""
@@ -80,14 +90,14 @@ class Coordinator:
             advantage = differences(self.critic.net, obs, bernoulli(chance, self.rng))
             advantage = advantage / advantage.std().clamp(min=1e-6)
         entropy = softplus(logits) - logits * chance
-        return (chance * advantage + self.cfg.entropy * entropy).mean()
+        return (chance * advantage + self.cfg.ent_coef * entropy).mean()
 
     def learners(self) -> Learners:
         """Actor and critic."""
         return [self.actor, self.critic]
 
     def _parts(self) -> checkpoint.Parts:
-        return {"actor": self.actor, "critic": self.critic, "standard": self.standard}
+        return {"actor": self.actor, "critic": self.critic, "standardiser": self.standardiser}
 
     def state_dict(self) -> State:
         """Networks and statistics; the generator belongs to its owner."""
@@ -98,13 +108,13 @@ class Coordinator:
         checkpoint.load_parts(state, self._parts())
 
 
-def worth(critic: nn.Module, obs: Obs, assignment: Tensor) -> Tensor:
+def assignment_value(critic: nn.Module, obs: Obs, assignment: Tensor) -> Tensor:
     """The critic's value of an assignment, a sum over pairs: (B, N, M) -> (B,)."""
     return critic(append(obs, pair=assignment.unsqueeze(-1))).sum((1, 2, 3))
 
 
 def differences(critic: PairNet, obs: Obs, assignment: Tensor) -> Tensor:
     """Q(s, g with g_ij = 1) - Q(s, g with g_ij = 0) for every pair, the other pairs as in `assignment`. (B, N, M)."""
-    told = append(obs, pair=assignment.unsqueeze(-1))
-    change = critic.flips(told) - critic(told).sum((1, 2, 3)).view(-1, 1, 1)
+    given = append(obs, pair=assignment.unsqueeze(-1))
+    change = critic.flips(given) - critic(given).sum((1, 2, 3)).view(-1, 1, 1)
     return change * (1 - 2 * assignment)

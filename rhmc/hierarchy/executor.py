@@ -17,70 +17,76 @@ from torch.nn.functional import mse_loss, one_hot
 from rhmc.hierarchy.filters import FILTERS
 from rhmc.learning import checkpoint
 from rhmc.learning.learner import Learner, Learners, pack_step, taken, unpack
-from rhmc.learning.normalisation import Scale, Standard
-from rhmc.learning.settings import Slow
+from rhmc.learning.normalisation import Scale, Standardiser
+from rhmc.learning.settings import TargetNetworks
 from rhmc.networks.nets import ENCODERS, Sizes, append, team
 from rhmc.networks.sampling import gumbel, mix, straight_through
-from rhmc.types import Batch, Obs, Spec, State, Transition, assigned_reward
+from rhmc.types import Batch, Frozen, Obs, Spec, State, Transition, assigned_reward
 
 
-class Config(Slow):
-    """Settings of the low level; lr and gamma are the paper's."""
+class Settings(Frozen):
+    """The block `executor`; gamma is the paper's."""
 
-    filter: Literal["on", "off"] = Field("on", description="hide unassigned targets from the executors (Eq. 10)")
-    executor: Literal["gumbel", "expected", "mixed"] = Field(
+    method: Literal["gumbel", "expected", "qmix"] = Field(
         "gumbel",
         description="an actor with a straight-through Gumbel-softmax, or with the expectation over own actions; or no "
-        "actor: the best of own values, learned through a mixture (`rhmc.hierarchy.mixing_executor`)",
+        "actor: greedy on own action values, learned by value mixing (`rhmc.hierarchy.mixing_executor`)",
     )
-    low_reward: Literal["local", "team"] = Field(
-        "local", description="what the executors are paid: their scores on assigned targets, or the team's reward"
+    reward: Literal["local", "team"] = Field(
+        "local", description="reward of the executors: their scores on assigned targets, or the team's reward"
     )
-    gamma_l: float = Field(0.99, ge=0, le=1)
-    standardise_l: Scale = Field("none", description="as `standardise` of other methods, for the executors")
+    gamma: float = Field(0.99, ge=0, le=1)
+    standardise: Scale = Field("none", description="as `standardise` of other methods")
     epsilon: float = Field(0.05, ge=0, le=1, description="share of actions drawn at random while exploring")
     logit_penalty: float = Field(1e-3, ge=0, description="weight of the squared logits (as in MADDPG)")
-    batch: int = Field(256, ge=1, description="rows of an update")
+    batch_size: int = Field(256, ge=1, description="rows of an update")
+
+
+class Config(TargetNetworks):
+    """Settings of a method with executors; lr is the paper's."""
+
+    filter: Literal["on", "off"] = Field("on", description="hide unassigned targets from the executors (Eq. 10)")
+    executor: Settings = Settings()
 
 
 class Executor:
     """All executors: one actor and one critic, shared parameters. Assignments are (B, N, M) float, 0 or 1."""
 
     def __init__(self, cfg: Config, spec: Spec, rng: Generator) -> None:
-        self.cfg, self.actions = cfg, spec.actions
-        self.filter, self.paid = cfg.filter, PAID[cfg.low_reward]
+        self.cfg, self.actions = cfg.executor, spec.actions
+        self.filter, self.reward_fn = cfg.filter, REWARDS[self.cfg.reward]
         policies = {"gumbel": partial(straight_through, rng=rng), "expected": partial(torch.softmax, dim=-1)}
-        self.policy: Callable[[Tensor], Tensor] = policies[cfg.executor]
+        self.policy: Callable[[Tensor], Tensor] = policies[self.cfg.method]
         encoder, sizes = ENCODERS[cfg.encoder], Sizes.of(spec, pair=1)
-        local = partial(encoder.local, sizes, cfg.hidden, spec.actions)
-        central = partial(encoder.central, sizes, cfg.hidden, spec.actions, joint=spec.actions)
+        local = partial(encoder.local, sizes, cfg.hidden_dim, spec.actions)
+        central = partial(encoder.central, sizes, cfg.hidden_dim, spec.actions, joint=spec.actions)
         actor, critic = (team(make, spec.agents, share=cfg.share).to(rng.device) for make in (local, central))
-        self.actor = Learner(actor, lr=cfg.lr, polyak=cfg.polyak, clip=cfg.grad_clip)
-        self.critic = Learner(critic, lr=cfg.lr, polyak=cfg.polyak, clip=cfg.grad_clip)
-        self.standard = Standard(cfg.standardise_l, rng.device)
+        self.actor = Learner(actor, lr=cfg.lr, tau=cfg.tau, max_grad_norm=cfg.max_grad_norm)
+        self.critic = Learner(critic, lr=cfg.lr, tau=cfg.tau, max_grad_norm=cfg.max_grad_norm)
+        self.standardiser = Standardiser(self.cfg.standardise, rng.device)
 
     def act(self, obs: Obs, assignment: Tensor, rng: Generator, *, explore: bool) -> Tensor:
         """Actions (B, N) int64: sampled from the softened policy, or its greatest logit."""
-        logits = self.actor.net(seen(self.filter, obs, assignment))
+        logits = self.actor.net(filtered_obs(self.filter, obs, assignment))
         if explore:
             logits = mix(logits.softmax(-1), 1 / self.actions, self.cfg.epsilon).log() + gumbel(logits.shape, rng)
         return logits.argmax(-1)
 
     def rows(self, t: Transition, assignment: Tensor) -> Batch:
         """One row per environment of Alg. 2's B_l."""
-        reward = self.paid(t, assignment)
-        self.standard.see_rewards(reward)
+        reward = self.reward_fn(t, assignment)
+        self.standardiser.update_rewards(reward)
         return pack_step(t) | {"assignment": assignment, "reward": reward}
 
     def update(self, rows: Batch) -> Batch:
         """One step of the critic (Eq. 11) and one of the actor (Eq. 13, ascent)."""
         g, obs, joint = rows["assignment"], unpack(rows), self._one_hot(rows["action"])
-        q = self.critic.net(told(obs, g), joint=joint)
+        q = self.critic.net(with_assignment(obs, g), joint=joint)
         chosen = taken(q, rows["action"])
-        target = self._target(rows)
-        self.standard.see_returns(target)
-        td = mse_loss(chosen, self.standard.target(target))
-        logits = self.actor.net(seen(self.filter, obs, g))
+        td_target = self._target(rows)
+        self.standardiser.update_returns(td_target)
+        td = mse_loss(chosen, self.standardiser.target(td_target))
+        logits = self.actor.net(filtered_obs(self.filter, obs, g))
         gain = (q.detach() * self.policy(logits)).sum(-1).mean()
         self.critic.update(td)
         self.actor.update(self.cfg.logit_penalty * logits.square().mean() - gain)
@@ -90,9 +96,11 @@ class Executor:
     @torch.no_grad()
     def _target(self, rows: Batch) -> Tensor:
         g, after = rows["assignment"], unpack(rows, "next_")
-        best = self.actor.slow(seen(self.filter, after, g)).argmax(-1)
-        value = self.standard.value(taken(self.critic.slow(told(after, g), joint=self._one_hot(best)), best))
-        return self.standard.reward(rows["reward"]) + self.cfg.gamma_l * (~rows["terminal"]).unsqueeze(-1) * value
+        best = self.actor.target_net(filtered_obs(self.filter, after, g)).argmax(-1)
+        value = self.standardiser.value(
+            taken(self.critic.target_net(with_assignment(after, g), joint=self._one_hot(best)), best)
+        )
+        return self.standardiser.reward(rows["reward"]) + self.cfg.gamma * (~rows["terminated"]).unsqueeze(-1) * value
 
     def _one_hot(self, action: Tensor) -> Tensor:
         return one_hot(action, self.actions).float()
@@ -102,7 +110,7 @@ class Executor:
         return [self.actor, self.critic]
 
     def _parts(self) -> checkpoint.Parts:
-        return {"actor": self.actor, "critic": self.critic, "standard": self.standard}
+        return {"actor": self.actor, "critic": self.critic, "standardiser": self.standardiser}
 
     def state_dict(self) -> State:
         """Networks and statistics; the generator belongs to its owner."""
@@ -113,14 +121,14 @@ class Executor:
         checkpoint.load_parts(state, self._parts())
 
 
-def told(obs: Obs, assignment: Tensor) -> Obs:
+def with_assignment(obs: Obs, assignment: Tensor) -> Obs:
     """The observation with the assignment as the last feature of every pair."""
     return append(obs, pair=assignment.unsqueeze(-1))
 
 
-def seen(name: str, obs: Obs, assignment: Tensor) -> Obs:
-    """The same as an executor gets it: behind the filter `name` (Eq. 10)."""
-    return told(obs._replace(pairs=FILTERS[name](obs.pairs, assignment)), assignment)
+def filtered_obs(name: str, obs: Obs, assignment: Tensor) -> Obs:
+    """The observation of an executor: filtered by the filter `name` (Eq. 10), with the assignment."""
+    return with_assignment(obs._replace(pairs=FILTERS[name](obs.pairs, assignment)), assignment)
 
 
 def _local(t: Transition, assignment: Tensor) -> Tensor:
@@ -131,4 +139,4 @@ def _team(t: Transition, assignment: Tensor) -> Tensor:
     return t.reward.unsqueeze(-1).expand(assignment.shape[:2])
 
 
-PAID = {"local": _local, "team": _team}
+REWARDS = {"local": _local, "team": _team}

@@ -1,4 +1,4 @@
-"""How often Algorithm 1 falls short of the optimum that Theorem 1 promises: `rhmc theorem`.
+"""Share of instances in which Algorithm 1 falls short of the optimum that Theorem 1 promises: `rhmc theorem`.
 
 Sizes are written agents x options x targets.
 """

@@ -8,7 +8,7 @@ from rhmc.types import State
 
 
 class Part(Protocol):
-    """What has a state: a learner, a replay, a rollout, statistics."""
+    """Anything with a state: a learner, a replay, a rollout, statistics."""
 
     def state_dict(self) -> State: ...
     def load_state_dict(self, state: Any) -> object: ...

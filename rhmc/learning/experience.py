@@ -1,4 +1,4 @@
-"""What methods that learn from a replay or from their latest steps share: rows kept until they are due."""
+"""Experience kept until an update is due: a replay buffer for off-policy methods, rollouts for on-policy ones."""
 
 from collections.abc import Callable, Iterator
 
@@ -6,16 +6,22 @@ import torch
 from torch import Generator, Tensor
 
 from rhmc.learning.learner import Replay, pack_step, unpack
-from rhmc.learning.settings import OffPolicy
+from rhmc.learning.settings import Replayed
 from rhmc.types import Batch, Obs, State, Transition
 
 
 class Experience:
-    """A replay and its pace: after the warm-up, one update for every `steps_per_update` environment steps."""
+    """A replay buffer and its pace: after `learning_starts`, one update for every `train_freq` environment steps.
 
-    def __init__(self, cfg: OffPolicy, rng: Generator) -> None:
-        self.cfg = cfg
-        self.replay = Replay(cfg.buffer, rng)
+    Args:
+        cfg: size and pace.
+        batch_size: rows of an update.
+        rng: generator for sampling; its device holds the rows.
+    """
+
+    def __init__(self, cfg: Replayed, batch_size: int, rng: Generator) -> None:
+        self.cfg, self.batch_size = cfg, batch_size
+        self.replay = Replay(cfg.buffer_size, rng)
         self.steps = self.updates = 0
 
     def add(self, rows: Batch, steps: int) -> None:
@@ -25,9 +31,9 @@ class Experience:
 
     def due(self) -> Iterator[Batch]:
         """A batch for every update that is due."""
-        while self.replay.size and self.updates < (self.steps - self.cfg.warmup) // self.cfg.steps_per_update:
+        while self.replay.size and self.updates < (self.steps - self.cfg.learning_starts) // self.cfg.train_freq:
             self.updates += 1
-            yield self.replay.sample(self.cfg.batch)
+            yield self.replay.sample(self.batch_size)
 
     def state_dict(self) -> State:
         """Rows and counters; the generator belongs to its owner."""
@@ -48,7 +54,7 @@ class Rollout:
 
     def add(self, t: Transition, **more: Tensor) -> None:
         """Keep one step of B environments, and what else is needed of it, (B, ...) each."""
-        self.rows.append(pack_step(t) | {"ended": t.terminal | t.truncated} | more)
+        self.rows.append(pack_step(t) | {"done": t.terminated | t.truncated} | more)
 
     def take(self) -> Batch | None:
         """All rows as (T, B, ...) once there are T = `length` of them; the next rollout then starts."""
@@ -80,11 +86,11 @@ def minibatches(rows: Batch, epochs: int, parts: int, rng: Generator) -> Iterato
 
 
 def ends(rows: Batch) -> tuple[Tensor, Obs]:
-    """Where the true successor of a step is not the next row, (T, B) bool, and these successors, leading K.
+    """Steps whose true successor is not the next row, (T, B) bool, and these successors, leading K.
 
-    That is where an episode ends and in the last row.
+    Such steps end an episode or stand in the last row.
     """
-    last = rows["ended"].clone()
+    last = rows["done"].clone()
     last[-1] = True
     after = {key: rows[key][last] for key in ("next_agents", "next_pairs", "next_peers")}
     return last, unpack(after, "next_")
@@ -98,6 +104,6 @@ def values(network: Callable[[Obs], Tensor], rows: Batch) -> tuple[Tensor, Tenso
     """
     value = network(unpack(flat(rows))).unflatten(0, rows["reward"].shape)
     last, after = ends(rows)
-    following = torch.cat((value[1:], value[-1:]))
-    following[last] = network(after)
-    return value, following
+    next_values = torch.cat((value[1:], value[-1:]))
+    next_values[last] = network(after)
+    return value, next_values

@@ -1,4 +1,4 @@
-"""What every learner shares: a replay of rows, and a network with its slow copy and optimiser."""
+"""Parts of every learner: a replay buffer of rows, and a network with its target network and optimiser."""
 
 from copy import deepcopy
 from typing import Any, Generic, TypeVar
@@ -54,25 +54,25 @@ class Replay:
 
 
 class Learner(Generic[Net]):
-    """A network, its slowly following copy and its optimiser. The loss is handed in at each update.
+    """A network, its target network and its optimiser. The loss is handed in at each update.
 
     Args:
-        net: what learns.
+        net: the network that learns.
         lr: Adam's step size.
-        polyak: share of the slow copy kept per update (rho of Eq. 8 and 12); 1 leaves it as it was.
-        clip: largest norm of the gradient.
+        tau: share of the way that the target network moves per update (1 - rho of Eq. 8 and 12); 0 leaves it as it is.
+        max_grad_norm: largest norm of the gradient.
     """
 
-    def __init__(self, net: Net, *, lr: float, polyak: float = 0.995, clip: float = 10.0) -> None:
-        self.net, self.slow = net, deepcopy(net).requires_grad_(False)
-        self.polyak, self.clip = polyak, clip
+    def __init__(self, net: Net, *, lr: float, tau: float = 0.005, max_grad_norm: float = 10.0) -> None:
+        self.net, self.target_net = net, deepcopy(net).requires_grad_(False)
+        self.tau, self.max_grad_norm = tau, max_grad_norm
         self.params: list[Tensor] = list(net.parameters())
-        self.slow_params: list[Tensor] = list(self.slow.parameters())
+        self.target_params: list[Tensor] = list(self.target_net.parameters())
         self.lr = lr
         self.optimiser = torch.optim.Adam(self.params, lr=lr, fused=True)
 
     def anneal(self, left: float) -> None:
-        """From now on, steps of `left` times the size given at the start."""
+        """Set the step size to `left` times the one given at the start."""
         for group in self.optimiser.param_groups:
             group["lr"] = self.lr * left
 
@@ -81,25 +81,25 @@ class Learner(Generic[Net]):
         grads = torch.autograd.grad(loss, self.params)
         for param, grad in zip(self.params, grads, strict=True):
             param.grad = grad
-        norm = nn.utils.clip_grad_norm_(self.params, self.clip, foreach=True)
+        norm = nn.utils.clip_grad_norm_(self.params, self.max_grad_norm, foreach=True)
         self.optimiser.step()
-        if self.polyak < 1:
+        if self.tau > 0:
             with torch.no_grad():
-                torch._foreach_lerp_(self.slow_params, self.params, 1 - self.polyak)
+                torch._foreach_lerp_(self.target_params, self.params, self.tau)
         return norm
 
     def state_dict(self) -> State:
-        """Network, slow copy and optimiser, live: write them out before the next update."""
+        """Network, target network and optimiser, live: write them out before the next update."""
         return {
             "net": self.net.state_dict(),
-            "slow": self.slow.state_dict(),
+            "target_net": self.target_net.state_dict(),
             "optimiser": self.optimiser.state_dict(),
         }
 
     def load_state_dict(self, state: State) -> None:
         """Continue from `state_dict`."""
         self.net.load_state_dict(state["net"])
-        self.slow.load_state_dict(state["slow"])
+        self.target_net.load_state_dict(state["target_net"])
         self.optimiser.load_state_dict(state["optimiser"])
 
 
@@ -119,8 +119,8 @@ def unpack(rows: Batch, prefix: str = "") -> Obs:
 
 
 def pack_step(t: Transition) -> Batch:
-    """One acted step as rows, (B, ...) each: what was seen before and after, action, reward, terminal."""
-    rows = {"action": t.action, "reward": t.reward, "terminal": t.terminal}
+    """One acted step as rows, (B, ...) each: observations before and after, action, reward, terminated."""
+    rows = {"action": t.action, "reward": t.reward, "terminated": t.terminated}
     return pack(t.obs) | pack(t.next_obs, "next_") | rows
 
 

@@ -1,8 +1,7 @@
-"""One switch for the scale of rewards and values.
+"""Standardisation of rewards and values, with one switch.
 
-`reward`: a learner is paid (reward - mean) / deviation. `return`: networks predict (return - mean) / deviation (the
-value normalisation of Yu et al. 2022, EPyMARL's standardised returns). `none`: as they come. Statistics are moving
-averages with their start corrected for.
+`reward`: a method learns from (reward - mean) / deviation. `return`: networks predict (return - mean) / deviation (the
+value normalisation of Yu et al. 2022, EPyMARL's standardised returns). `none`: neither.
 """
 
 from typing import Literal
@@ -13,64 +12,45 @@ from torch import Tensor
 from rhmc.types import State
 
 Scale = Literal["none", "reward", "return"]
-KEPT = 0.999  # share of the statistics kept per batch seen
+KEPT = 0.999  # share of the statistics kept per update
 LEAST = 1e-2  # smallest deviation
 
 
-class Standard:
-    """Mean and deviation of the rewards or returns met so far; 0 and 1 until the first.
+class RunningMeanStd:
+    """Moving averages of mean and deviation, corrected for their start; 0 and 1 before the first update.
 
     Args:
-        mode: what is standardised.
         device: where the statistics live.
     """
 
-    def __init__(self, mode: Scale, device: torch.device) -> None:
-        self.mode = mode
+    def __init__(self, device: torch.device) -> None:
         self.sums = torch.zeros(3, device=device)  # of weights, values and squares
 
-    def see_rewards(self, reward: Tensor) -> None:
-        """Count in rewards as they come, any shape."""
-        if self.mode == "reward":
-            self._see(reward)
-
-    def see_returns(self, value: Tensor) -> None:
-        """Count in returns that are about to be a target, any shape."""
-        if self.mode == "return":
-            self._see(value)
-
-    def reward(self, reward: Tensor) -> Tensor:
-        """What the learner is paid."""
-        return self._down(reward) if self.mode == "reward" else reward
-
-    def value(self, output: Tensor) -> Tensor:
-        """A network's output as a return."""
-        if self.mode != "return":
-            return output
-        mean, deviation = self._moments()
-        return output * deviation + mean
-
-    def target(self, value: Tensor) -> Tensor:
-        """A return as what a network should put out."""
-        return self._down(value) if self.mode == "return" else value
-
-    def _down(self, x: Tensor) -> Tensor:
-        mean, deviation = self._moments()
-        return (x - mean) / deviation
-
-    def _see(self, x: Tensor) -> None:
-        if not x.numel():
+    def update(self, values: Tensor) -> None:
+        """Count in values of any shape."""
+        if not values.numel():
             return
-        new = torch.stack((torch.ones_like(self.sums[0]), x.mean(), x.square().mean()))
+        new = torch.stack((torch.ones_like(self.sums[0]), values.mean(), values.square().mean()))
         self.sums = torch.lerp(new, self.sums, KEPT)
 
-    def _moments(self) -> tuple[Tensor, Tensor]:
+    def normalise(self, values: Tensor) -> Tensor:
+        """(values - mean) / deviation."""
+        mean, deviation = self.moments()
+        return (values - mean) / deviation
+
+    def denormalise(self, values: Tensor) -> Tensor:
+        """The inverse of `normalise`."""
+        mean, deviation = self.moments()
+        return values * deviation + mean
+
+    def moments(self) -> tuple[Tensor, Tensor]:
+        """Mean and deviation, () each."""
         weight, mean, square = self.sums
-        seen = weight > 0
+        updated = weight > 0
         weight = weight.clamp(min=1e-12)
         mean = mean / weight
         deviation = (square / weight - mean.square()).clamp(min=LEAST**2).rsqrt().reciprocal()  # MKL's `sqrt` differs
-        return torch.where(seen, mean, 0.0), torch.where(seen, deviation, 1.0)
+        return torch.where(updated, mean, 0.0), torch.where(updated, deviation, 1.0)
 
     def state_dict(self) -> State:
         """The statistics."""
@@ -79,3 +59,38 @@ class Standard:
     def load_state_dict(self, state: State) -> None:
         """Continue from `state_dict`."""
         self.sums = state["sums"].to(self.sums.device)
+
+
+class Standardiser(RunningMeanStd):
+    """Rewards, network outputs and targets on the scale of one mode; the statistics are of rewards or of returns.
+
+    Args:
+        mode: quantity that is standardised.
+        device: where the statistics live.
+    """
+
+    def __init__(self, mode: Scale, device: torch.device) -> None:
+        super().__init__(device)
+        self.mode = mode
+
+    def update_rewards(self, reward: Tensor) -> None:
+        """Count in raw rewards, any shape, where rewards are standardised."""
+        if self.mode == "reward":
+            self.update(reward)
+
+    def update_returns(self, returns: Tensor) -> None:
+        """Count in returns that become targets, any shape, where returns are standardised."""
+        if self.mode == "return":
+            self.update(returns)
+
+    def reward(self, reward: Tensor) -> Tensor:
+        """A raw reward as the method learns from it."""
+        return self.normalise(reward) if self.mode == "reward" else reward
+
+    def value(self, output: Tensor) -> Tensor:
+        """A network's output as a return."""
+        return self.denormalise(output) if self.mode == "return" else output
+
+    def target(self, value: Tensor) -> Tensor:
+        """A return as the target of a network's output."""
+        return self.normalise(value) if self.mode == "return" else value

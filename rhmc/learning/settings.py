@@ -1,4 +1,4 @@
-"""Settings that several methods have, under one name and one meaning each."""
+"""Settings shared by several methods, each with one name and one meaning."""
 
 from pydantic import Field
 
@@ -8,23 +8,23 @@ from rhmc.types import Frozen
 
 
 class Networks(Frozen):
-    """What every method has; the defaults are the paper's (section 5.1) where it gives a value."""
+    """Settings of every method; the defaults are the paper's (section 5.1) where it gives a value."""
 
     encoder: EncoderName = "mlp"
-    hidden: int = Field(64, ge=1, description="units of each hidden layer")
-    share: bool = Field(True, description="one network for all agents; with `mlp` it is told the agent's one-hot id")
+    hidden_dim: int = Field(64, ge=1, description="units of each hidden layer")
+    share: bool = Field(True, description="one network for all agents; `mlp` adds a one-hot id of the agent")
     lr: float = Field(5e-4, gt=0, description="Adam's step size")
-    grad_clip: float = Field(10.0, gt=0, description="largest norm of a network's gradient")
+    max_grad_norm: float = Field(10.0, gt=0, description="largest norm of a network's gradient")
 
 
-class Slow(Networks):
-    """For methods that learn towards a slow copy of a network."""
+class TargetNetworks(Networks):
+    """Settings of methods whose targets come from target networks."""
 
-    polyak: float = Field(0.995, ge=0, le=1, description="share of the slow copies kept per update")
+    tau: float = Field(0.005, ge=0, le=1, description="share of the way that target networks move per update")
 
 
 class Standardised(Frozen):
-    """For methods that learn from one reward and one discount."""
+    """Settings of methods with one reward and one discount."""
 
     gamma: float = Field(0.99, ge=0, le=1)
     standardise: Scale = Field(
@@ -33,17 +33,22 @@ class Standardised(Frozen):
     )
 
 
-class OffPolicy(Frozen):
-    """For methods that learn from a replay."""
+class Replayed(Frozen):
+    """Settings of methods that learn from a replay buffer."""
 
-    buffer: int = Field(50_000, ge=1, description="rows kept: environment steps")
-    batch: int = Field(256, ge=1, description="rows of an update")
-    warmup: int = Field(2_000, ge=0, description="environment steps before the first update")
-    steps_per_update: int = Field(64, ge=1, description="environment steps collected for each update")
+    buffer_size: int = Field(50_000, ge=1, description="rows kept: environment steps")
+    learning_starts: int = Field(2_000, ge=0, description="environment steps before the first update")
+    train_freq: int = Field(64, ge=1, description="environment steps collected for each update")
+
+
+class OffPolicy(Replayed):
+    """Settings of off-policy methods with one kind of update."""
+
+    batch_size: int = Field(256, ge=1, description="rows of an update")
 
 
 class OnPolicy(Frozen):
-    """For methods that learn from what they have just done."""
+    """Settings of on-policy methods."""
 
-    rollout: int = Field(25, ge=1, description="steps of each environment between updates")
-    entropy: float = Field(0.01, ge=0, description="weight of the policy's entropy")
+    n_steps: int = Field(25, ge=1, description="steps of each environment between updates")
+    ent_coef: float = Field(0.01, ge=0, description="weight of the policy's entropy")

@@ -1,4 +1,4 @@
-"""What the output of an actor means to its critic: a draw among choices, or a point of a cube."""
+"""Output heads of actors and the form of their actions for a critic: a draw among choices, or a point of a cube."""
 
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
@@ -12,7 +12,7 @@ from rhmc.types import Obs
 
 
 class Head(Protocol):
-    """What the actor's output (B, N, A) means. An action is (B, N) int64 or (B, N, A) float."""
+    """The meaning of an actor's output (B, N, A). An action is (B, N) int64 or (B, N, A) float."""
 
     def critic(self, central: Callable[..., nn.Module]) -> nn.Module:
         """A network of (obs, own, joint) -> (B, N, 1) from `central(out, own=)`."""

@@ -1,6 +1,6 @@
 """Training as an iterator of metrics on a fixed grid of steps; its state is a checkpoint."""
 
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import torch
 from pydantic import Field
@@ -18,14 +18,11 @@ class Config(Frozen):
 
     steps: int = Field(5_000_000, ge=1)
     num_envs: int = Field(128, ge=1, description="parallel copies; part of a run's identity, trajectories depend on it")
-    time_limit: Literal["bootstrap", "terminal"] = Field(
-        "bootstrap", description="what the time limit is to every method: a cut that bootstraps, or an end"
+    bootstrap_on_truncation: bool = Field(
+        True, description="for every method, the time limit is a truncation (bootstrap); false: a termination"
     )
-    anneal: float = Field(
-        1.0,
-        ge=0,
-        le=1,
-        description="share of every step size that is left at the end of the budget (linear)",
+    final_lr_fraction: float = Field(
+        1.0, ge=0, le=1, description="share of every step size that is left at the end of the budget (linear)"
     )
     evaluations: int = Field(100, ge=1, description="points of the curve after the one at step 0")
     eval_episodes: int = Field(100, ge=1)
@@ -68,7 +65,7 @@ class Trainer:
 
     @property
     def done(self) -> bool:
-        """Whether the budget is spent and evaluated."""
+        """True once the budget is spent and evaluated."""
         return self.point >= self.cfg.evaluations
 
     def __iter__(self) -> Self:
@@ -91,7 +88,7 @@ class Trainer:
         means = Means()
         while self.step < until:
             means.add({"reward": self._act()})
-            left = linear(1.0, self.cfg.anneal, self.cfg.steps, self.step)
+            left = linear(1.0, self.cfg.final_lr_fraction, self.cfg.steps, self.step)
             for learner in self.algorithm.learners():
                 learner.anneal(left)
             means.add(self.algorithm.update())
@@ -104,7 +101,7 @@ class Trainer:
         action, self.carry, extra = self.algorithm.act(obs, self.carry, self.act_rng, explore=True)
         options = self.env.options()
         step = self.env.step(action, extra.get("assignment"))
-        terminal = step.terminal | step.truncated if self.cfg.time_limit == "terminal" else step.terminal
+        terminated = step.terminated if self.cfg.bootstrap_on_truncation else step.terminated | step.truncated
         self.algorithm.observe(
             Transition(
                 obs,
@@ -112,7 +109,7 @@ class Trainer:
                 step.reward,
                 step.local,
                 step.completed,
-                terminal,
+                terminated,
                 step.truncated,
                 step.final_obs,
                 options,
@@ -164,7 +161,7 @@ class Means:
 
 
 def misfit(env: EnvConfig, algo: Any) -> str:
-    """Why the method cannot act in the task, or nothing."""
+    """Reason that the method cannot act in the task; empty if it can."""
     if getattr(env, "continuous", False) and "continuous" not in ALGORITHMS[algo.kind].about.actions:
         return f"continuous: '{algo.kind}' chooses among discrete actions; allowed: false"
     return ""

@@ -3,6 +3,7 @@
 import io
 from functools import cache
 from itertools import product
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import pytest
@@ -19,18 +20,18 @@ from rhmc.networks.nets import Unshared
 from rhmc.training.trainer import Config, Trainer
 from rhmc.types import Batch, Obs, Transition
 from tests import toy
+from tests.blocks import fields, fitted, flat, nested
 from tests.conformance import DifferentError, assert_same
 
 EPISODE = 7  # of both tasks here, so that runs of a few steps cross its end
 SMALL = {
-    "hidden": 8,
+    "hidden_dim": 8,
     "pretrain": 20,
-    "buffer": 20,
-    "batch": 8,
-    "batch_h": 8,
-    "warmup": 8,
-    "steps_per_update": 4,
-    "rollout": 3,
+    "buffer_size": 20,
+    "batch_size": 8,
+    "learning_starts": 8,
+    "train_freq": 4,
+    "n_steps": 3,
     "epochs": 2,
     "minibatches": 2,
     "assignment_period": 1,
@@ -45,22 +46,27 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {  # beside the defaults, on b
     "rhmc none": ("rhmc", {"regulator": "none", "filter": "off"}),
     "rhmc exact": (
         "rhmc",
-        {"regulator": "exact", "horizon": 2, "coordinator": "counterfactual", "executor": "expected"},
+        {"regulator": "exact", "horizon": 2, "coordinator.gradient": "counterfactual", "executor.method": "expected"},
     ),
-    "rhmc mixed": ("rhmc", {"executor": "mixed", "low_reward": "team", "epsilon": 0.5}),
-    "rhmc mixed, scaled": (
+    "rhmc qmix": ("rhmc", {"executor.method": "qmix", "executor.reward": "team", "executor.epsilon": 0.5}),
+    "rhmc qmix, scaled": (
         "rhmc",
-        {"executor": "mixed", "epsilon": 0.5, "standardise_l": "reward", "standardise_h": "return"},
+        {
+            "executor.method": "qmix",
+            "executor.epsilon": 0.5,
+            "executor.standardise": "reward",
+            "coordinator.standardise": "return",
+        },
     ),
-    "rhmc scaled": ("rhmc", {"standardise_l": "return", "standardise_h": "reward"}),
+    "rhmc scaled": ("rhmc", {"executor.standardise": "return", "coordinator.standardise": "reward"}),
     "rhmc period 3": ("rhmc", {"assignment_period": 3}),
     "rhmc period 3 counterfactual": (
         "rhmc",
-        {"assignment_period": 3, "coordinator": "counterfactual", "regulator": "exact"},
+        {"assignment_period": 3, "coordinator.gradient": "counterfactual", "regulator": "exact"},
     ),
-    "hitmac period 3": ("hitmac", {"assignment_period": 3, "rollout": 2}),
+    "hitmac period 3": ("hitmac", {"assignment_period": 3, "n_steps": 2}),
     "mappo kl_adaptive": ("mappo", {"objective": "kl_adaptive"}),
-    "coma critic": ("coma", {"worth": "critic"}),
+    "coma critic": ("coma", {"advantage_estimator": "critic"}),
 }
 SCALES = ("none", "reward", "return")
 
@@ -75,7 +81,7 @@ class Case(NamedTuple):
 def settle(kind: str, **changes: Any) -> Any:
     """A small version of a method; settings that it does not have are left out."""
     config = ALGORITHMS[kind].config
-    return config(**{k: v for k, v in SMALL.items() if k in config.model_fields} | changes)
+    return config(**nested(fitted(config, SMALL) | changes))
 
 
 BASIC = {
@@ -88,11 +94,15 @@ BASIC |= {
     if "continuous" in ALGORITHMS[kind].about.actions
 }
 UNSHARED = {f"{kind} unshared": Case(settle(kind, share=False), TASKS["navigation"]) for kind in ALGORITHMS}
+SCALE = {  # RHMC has one for each level, in variants of its own
+    kind: name
+    for kind, name in product(ALGORITHMS, ("standardise", "coordinator.standardise"))
+    if kind != "rhmc" and name in fields(ALGORITHMS[kind].config)
+}
 SCALED = {
-    f"{kind} {scale}": Case(settle(kind, standardise=scale), TASKS["navigation"])
-    for kind, scale in product(ALGORITHMS, SCALES)
-    if "standardise" in ALGORITHMS[kind].config.model_fields
-    and scale != ALGORITHMS[kind].config.model_fields["standardise"].default
+    f"{kind} {scale}": Case(settle(kind, **{name: scale}), TASKS["navigation"])
+    for (kind, name), scale in product(SCALE.items(), SCALES)
+    if scale != attrgetter(name)(ALGORITHMS[kind].config())
 }
 CASES = BASIC | UNSHARED | SCALED
 CASES |= {
@@ -485,7 +495,7 @@ def _shift(state: Any, size: float = 0.1) -> None:
 
 LOSSES = (functional.mse_loss, functional.huber_loss, functional.smooth_l1_loss, functional.l1_loss)
 # Rows of one step, seen once and as they are: what a loss is handed is then known.
-PLAIN = {"warmup": 0, "steps_per_update": 1, "rollout": 1, "epochs": 1, "minibatches": 1, "standardise": "none"}
+PLAIN = {"learning_starts": 0, "train_freq": 1, "n_steps": 1, "epochs": 1, "minibatches": 1, "standardise": "none"}
 PLAIN |= {"pretrain": 0, "assignment_period": 1}
 FLAG = torch.tensor([True])
 
@@ -508,8 +518,8 @@ class Targets(TorchFunctionMode):
 
 def plain(algo: Any, **changes: Any) -> Any:
     """A method's settings with those of `PLAIN` and `changes` that it has."""
-    known = {key: value for key, value in (PLAIN | changes).items() if key in type(algo).model_fields}
-    return algo.model_copy(update=known)
+    config = type(algo)
+    return config(**nested(flat(algo.model_dump()) | fitted(config, PLAIN | changes)))
 
 
 def transition(env: Env, obs: Obs, algo: Any, **changes: Any) -> Transition:
@@ -517,7 +527,7 @@ def transition(env: Env, obs: Obs, algo: Any, **changes: Any) -> Transition:
     action, _, extra = algo.act(obs, algo.carry(env.batch), seeded(), explore=True)
     options = env.options()
     s = env.step(action, extra.get("assignment"))
-    t = Transition(obs, action, s.reward, s.local, s.completed, s.terminal, s.truncated, s.final_obs, options, extra)
+    t = Transition(obs, action, s.reward, s.local, s.completed, s.terminated, s.truncated, s.final_obs, options, extra)
     return t._replace(**changes)
 
 
@@ -553,7 +563,7 @@ def test_targets_carry_no_gradient(case: Case) -> None:
 
 def slow_parameters(algo: Any) -> list[Tensor]:
     """Of the copies that targets come from; those of a learner that never follow are none."""
-    found = [p for learner in learners(algo) for p in learner.slow.parameters()]
+    found = [p for learner in learners(algo) for p in learner.target_net.parameters()]
     assert found
     return found
 
@@ -598,7 +608,7 @@ def test_no_loss_has_a_gradient_into_what_is_observed_afterwards(case: Case, mon
 
 @one_step
 def test_truncation_bootstraps_and_termination_does_not(case: Case) -> None:
-    going, cut, over = (learn(case, **flags)[0].values for flags in ({}, {"truncated": FLAG}, {"terminal": FLAG}))
+    going, cut, over = (learn(case, **flags)[0].values for flags in ({}, {"truncated": FLAG}, {"terminated": FLAG}))
     assert all(torch.equal(a, b) for a, b in zip(going, cut, strict=True))
     assert not any(torch.equal(a, b) for a, b in zip(going, over, strict=True))
 
@@ -608,7 +618,7 @@ def test_a_terminal_row_is_worth_its_reward(case: Case) -> None:
     """So the targets of a last step do not depend on what is observed after it; others do."""
     _, obs = world(case.env, batch=1)
     elsewhere = obs._replace(pairs=obs.pairs + 1)
-    for flags, equal in (({"terminal": FLAG}, True), ({"truncated": FLAG}, False), ({}, False)):
+    for flags, equal in (({"terminated": FLAG}, True), ({"truncated": FLAG}, False), ({}, False)):
         here, there = (learn(case, **flags, next_obs=after)[0].values for after in (obs, elsewhere))
         assert [torch.equal(a, b) for a, b in zip(here, there, strict=True)] == [equal] * len(here)
 
@@ -616,18 +626,18 @@ def test_a_terminal_row_is_worth_its_reward(case: Case) -> None:
 ON_POLICY = {
     name: case
     for name, case in ONE_STEP.items()
-    if "rollout" in type(case.algo).model_fields and getattr(case.algo, "pretrain", 0) == 0
+    if any(name.endswith("n_steps") for name in fields(type(case.algo))) and getattr(case.algo, "pretrain", 0) == 0
 }
 
 
-@pytest.mark.parametrize("flag", ["terminal", "truncated", None])
+@pytest.mark.parametrize("flag", ["terminated", "truncated", None])
 @pytest.mark.parametrize("case", ON_POLICY.values(), ids=ON_POLICY)
 def test_a_sequence_stops_where_an_episode_ends(case: Case, flag: str | None) -> None:
     """What happens in the next episode is nothing to the step before; within an episode it is."""
     env, obs = world(case.env, batch=1)
     found = []
     for shift in (0.0, 1.0):
-        algo = build(plain(case.algo, rollout=2), env, 1)
+        algo = build(plain(case.algo, n_steps=2), env, 1)
         start = obs._replace(pairs=obs.pairs + shift)
         with torch.no_grad():
             first = transition(env, obs, algo, next_obs=obs, reward=torch.ones(1), **({flag: FLAG} if flag else {}))
@@ -646,27 +656,26 @@ def test_a_sequence_stops_where_an_episode_ends(case: Case, flag: str | None) ->
 
 LEARNING = {  # of the tiny task; the rest are a method's defaults
     "lr": 5e-3,
-    "hidden": 32,
-    "polyak": 0.95,
+    "hidden_dim": 32,
+    "tau": 0.05,
     "gamma": 0.8,
-    "gamma_l": 0.8,
-    "gamma_h": 0.0,
-    "batch": 64,
-    "batch_h": 64,
-    "warmup": 300,
-    "steps_per_update": 32,
+    "executor.gamma": 0.8,
+    "coordinator.gamma": 0.0,
+    "batch_size": 64,
+    "learning_starts": 300,
+    "train_freq": 32,
     "epsilon_steps": 4000,
     "horizon": 3,
-    "coordinator": "counterfactual",
+    "coordinator.gradient": "counterfactual",
     "regulator": "exact",
     "assignment_period": 1,
-    "rollout": 6,
+    "n_steps": 6,
     "pretrain": 8000,
 }
 LEARNING_OF: dict[str, dict[str, Any]] = {  # what a method needs beside or instead of that
-    "maddpg": {"gamma": 0.6, "penalty": 1e-2, "batch": 128, "steps_per_update": 16},
-    "coma": {"gamma": 0.6, "entropy": 0.05, "epsilon": 0.1, "hidden": 64, "lr": 3e-3, "minibatches": 8},
-    "hitmac": {"gamma": 0.5, "hidden": 64, "lr": 3e-3},
+    "maddpg": {"gamma": 0.6, "penalty": 1e-2, "batch_size": 128, "train_freq": 16},
+    "coma": {"gamma": 0.6, "ent_coef": 0.05, "epsilon": 0.1, "hidden_dim": 64, "lr": 3e-3, "minibatches": 8},
+    "hitmac": {"coordinator.gamma": 0.5, "hidden_dim": 64, "lr": 3e-3},
 }
 STEPS = {"coma": 18_000, "hitmac": 14_000}  # 12 000 else
 
@@ -675,10 +684,10 @@ def returns(kind: str, **changes: Any) -> list[float]:
     """A method's mean return in the tiny task before and after learning."""
     config = ALGORITHMS[kind].config
     wanted = LEARNING | LEARNING_OF.get(kind, {})
-    known = {k: v for k, v in wanted.items() if k in config.model_fields}
+    known = fitted(config, wanted)
     run = Trainer(
         toy.Config(),  # type: ignore[arg-type]
-        config(**known | changes),
+        config(**nested(known | changes)),
         Config(steps=STEPS.get(kind, 12_000), num_envs=32, evaluations=1, eval_episodes=300, final_episodes=1),
         seed=0,
     )
@@ -700,17 +709,23 @@ def test_every_method_learns_the_tiny_task(kind: str, encoder: str) -> None:
 
 @pytest.mark.parametrize(("kind", "scale"), [name.split() for name in SCALED])
 def test_every_method_learns_with_every_standardisation(kind: str, scale: str) -> None:
-    assert_learned(returns(kind, encoder="pairwise", standardise=scale))
+    assert_learned(returns(kind, encoder="pairwise", **{SCALE[kind]: scale}))
 
 
 @pytest.mark.parametrize(
     "changes",
     [
-        {"executor": "mixed", "low_reward": "team"},
-        {"executor": "mixed", "standardise_l": "reward", "standardise_h": "reward"},
-        {"executor": "mixed", "low_reward": "team", "high_reward": "team", "regulator": "none", "filter": "off"},
-        {"standardise_l": "reward", "standardise_h": "return"},
-        {"standardise_l": "return"},
+        {"executor.method": "qmix", "executor.reward": "team"},
+        {"executor.method": "qmix", "executor.standardise": "reward", "coordinator.standardise": "reward"},
+        {
+            "executor.method": "qmix",
+            "executor.reward": "team",
+            "coordinator.reward": "team",
+            "regulator": "none",
+            "filter": "off",
+        },
+        {"executor.standardise": "reward", "coordinator.standardise": "return"},
+        {"executor.standardise": "return"},
     ],
     ids=str,
 )
@@ -754,14 +769,16 @@ def unshared(algo: Any) -> list[Unshared]:
 
 
 @pytest.mark.parametrize("kind", ALGORITHMS)
-def test_a_time_limit_that_ends_is_terminal_to_every_method(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_truncation_may_be_termination_to_every_method(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     final = []
-    for limit, over in (("bootstrap", False), ("terminal", True)):
-        run = Trainer(TASKS["navigation"], settle(kind), RUN.model_copy(update={"time_limit": limit}), seed=0)
+    for limit, over in ((True, False), (False, True)):
+        run = Trainer(
+            TASKS["navigation"], settle(kind), RUN.model_copy(update={"bootstrap_on_truncation": limit}), seed=0
+        )
         met, observe = [], run.algorithm.observe
         monkeypatch.setattr(run.algorithm, "observe", lambda t, met=met, observe=observe: (met.append(t), observe(t)))
         list(run)
         assert [bool(t.truncated.all()) for t in met] == [k % EPISODE == EPISODE - 1 for k in range(11)]
-        assert all(torch.equal(t.terminal, t.truncated & over) for t in met)
+        assert all(torch.equal(t.terminated, t.truncated & over) for t in met)
         final.append(torch.cat([p.flatten() for learner in learners(run.algorithm) for p in learner.params]))
     assert not torch.equal(*final)

@@ -19,8 +19,10 @@ from pipelines.tracking.plan import items, study_card
 from pipelines.tracking.tracker import MemoryTracker
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import ENVS
+from rhmc.learning.learner import Learner
 from rhmc.scripted.yardsticks import yardsticks
 from rhmc.training.trainer import Trainer
+from tests.blocks import fitted, flat, nested
 from tests.pipelines.support import tiny
 
 FILE = Path(__file__).with_name("digests.json")
@@ -28,12 +30,11 @@ DIGITS = 12
 SMALL = {  # widths as in the studies, where the processor chooses its instructions; everything else small
     "encoder": "pairwise",
     "pretrain": 600,
-    "buffer": 1000,
-    "batch": 64,
-    "batch_h": 64,
-    "warmup": 256,
-    "steps_per_update": 32,
-    "rollout": 10,
+    "buffer_size": 1000,
+    "batch_size": 64,
+    "learning_starts": 256,
+    "train_freq": 32,
+    "n_steps": 10,
     "epochs": 2,
     "minibatches": 2,
 }
@@ -43,12 +44,11 @@ VARIANTS: dict[str, dict[str, Any]] = {  # beside every method in every task
         "kind": "rhmc",
         "regulator": "exact",
         "horizon": 6,
-        "coordinator": "counterfactual",
-        "executor": "expected",
         "assignment_period": 5,
-        "standardise_h": "reward",
+        "coordinator": {"gradient": "counterfactual", "standardise": "reward"},
+        "executor": {"method": "expected"},
     },
-    "rhmc mixed": {"kind": "rhmc", "executor": "mixed", "low_reward": "team"},
+    "rhmc qmix": {"kind": "rhmc", "executor": {"method": "qmix", "reward": "team"}},
     "qmix mlp": {"kind": "qmix", "encoder": "mlp", "standardise": "return"},
     "mappo kl": {"kind": "mappo", "objective": "kl_adaptive", "encoder": "mlp"},
 }
@@ -65,10 +65,9 @@ def cases() -> dict[str, Callable[[], str]]:
 
 def setting(task: str, algo: dict[str, Any], **env: Any) -> Setting:
     """A short training."""
-    fields = ALGORITHMS[algo["kind"]].config.model_fields
-    small = {name: value for name, value in SMALL.items() if name in fields}
     task_fields = {"kind": task, "observation": "extended", **env}
-    return Setting.model_validate({"env": task_fields, "algo": small | algo, "trainer": RUN})
+    small = fitted(ALGORITHMS[algo["kind"]].config, SMALL)
+    return Setting.model_validate({"env": task_fields, "algo": nested(small | flat(algo)), "trainer": RUN})
 
 
 def _training(task: str, algo: dict[str, Any], **env: Any) -> Callable[[], str]:
@@ -77,9 +76,15 @@ def _training(task: str, algo: dict[str, Any], **env: Any) -> Callable[[], str]:
     def run() -> str:
         one = setting(task, algo, **env)
         trainer = Trainer(one.env, one.algo, one.trainer, 0)
-        return digest([list(trainer), [learner.state_dict() for learner in trainer.algorithm.learners()]])
+        return digest([list(trainer), [_learned(learner) for learner in trainer.algorithm.learners()]])
 
     return run
+
+
+def _learned(learner: Learner[Any]) -> dict[str, Any]:
+    """The state under the keys with which the digests were made: they are part of a digest."""
+    nets = {"net": learner.net.state_dict(), "slow": learner.target_net.state_dict()}
+    return nets | {"optimiser": learner.optimiser.state_dict()}
 
 
 def _yardsticks(task: str) -> Callable[[], str]:

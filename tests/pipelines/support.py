@@ -16,6 +16,8 @@ from pipelines.specs.identity import code_id
 from pipelines.specs.study import Resources, RunSpec, Setting, Study
 from pipelines.tracking.plan import Item, items
 from pipelines.workspace.process_pool import side_by_side
+from rhmc.algorithms import ALGORITHMS
+from tests.blocks import fitted, nested
 
 CODE = code_id("iql", "coverage")  # of all runs here
 
@@ -25,11 +27,22 @@ def setting(**algo: Any) -> Setting:
     return Setting.model_validate(
         {
             "env": {"kind": "coverage", "preset": "flat", "agents": 2, "targets": 2},
-            "algo": {"kind": "iql", "warmup": 64, "batch": 32, "steps_per_update": 16, "hidden": 16, "buffer": 400},
+            "algo": {
+                "kind": "iql",
+                "learning_starts": 64,
+                "batch_size": 32,
+                "train_freq": 16,
+                "hidden_dim": 16,
+                "buffer_size": 400,
+            },
             "trainer": {"steps": 600, "num_envs": 8, "evaluations": 3, "eval_episodes": 4, "final_episodes": 8},
         }
-        | ({"algo": {"kind": "iql", "warmup": 64, "batch": 32, **algo}} if algo else {})
+        | ({"algo": _own({"kind": "iql"} | algo)} if algo else {})
     )
+
+
+def _own(algo: dict[str, Any]) -> dict[str, Any]:
+    return nested(fitted(ALGORITHMS[algo["kind"]].config, {"learning_starts": 64, "batch_size": 32}) | algo)
 
 
 def spec(seed: int = 0, **algo: Any) -> RunSpec:

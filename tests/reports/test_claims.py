@@ -79,8 +79,8 @@ def test_c3(tmp_path: Path, level: float, others: Mapping[str, float], verdict: 
 
 
 def test_rhmc_with_other_settings_is_no_other_method(tmp_path: Path) -> None:
-    points, runs = study("coverage", arms(70.5, OTHERS | {"RHMC mixed": 80.0}), steps=PAPER)
-    runs = runs.assign(algorithm=runs["algorithm"].replace("rhmc mixed", "rhmc"))
+    points, runs = study("coverage", arms(70.5, OTHERS | {"RHMC qmix": 80.0}), steps=PAPER)
+    runs = runs.assign(algorithm=runs["algorithm"].replace("rhmc qmix", "rhmc"))
     assert verdicts(tmp_path, (points, runs))["C3"].verdict == "reproduced"
 
 

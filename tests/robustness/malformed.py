@@ -210,7 +210,7 @@ def studies() -> Iterator[Case]:
         ("base.trainer.num_envs", 10**9, "num_envs"),
         ("base.trainer.device", "gpu", "device", "cpu"),
         ("base.trainer.eval_seed", 2**64, "eval_seed"),
-        ("base.algo.hidden", 10**9, "hidden"),
+        ("base.algo.hidden_dim", 10**9, "hidden"),
         ("base.algo.extra", 1, "extra"),
         ("arms", {}, "arms"),
         ("arms", {"a\u001b[31mb": {}}, "arms"),
@@ -225,7 +225,7 @@ def studies() -> Iterator[Case]:
     for key in ("question", "base", "arms", "steps"):
         yield of(f"no {key}", tree("s.yaml", at(GOOD, key, ...)), key)
     yield of("NaN", text("s.yaml", json.dumps(at(GOOD, "base.algo.lr", float("nan"))).replace("NaN", ".nan")), "finite")
-    late = at(at(GOOD, "steps", 3_000), "base.algo.warmup", 20_000)
+    late = at(at(GOOD, "steps", 3_000), "base.algo.learning_starts", 20_000)
     words = ("study", "check", "s.yaml")  # said, not refused: a study may be a trial of everything but learning
     yield Case(
         "study files",

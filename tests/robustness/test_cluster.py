@@ -395,7 +395,7 @@ SEARCH = """\
 question: Which?
 base:
   env: {kind: coverage, agents: 2, targets: 2}
-  algo: {kind: iql, warmup: 64, batch: 32, steps_per_update: 16, hidden: 16, buffer: 400}
+  algo: {kind: iql, learning_starts: 64, batch_size: 32, train_freq: 16, hidden_dim: 16, buffer_size: 400}
   trainer: {num_envs: 8, evaluations: 8, eval_episodes: 4, final_episodes: 8}
 arms: {IQL: {space: {lr: {low: 1e-4, high: 1e-2, log: true}}}}
 trials: 2

@@ -124,7 +124,7 @@ def picture(home: Path) -> dict[str, Any]:
 
 def test_a_policy_of_a_method_that_bounds_nothing_travels(home: Path, there: Path, tmp_path: Path) -> None:
     """RHMC without a regulator keeps half-done periods whose bound is minus infinity."""
-    settled = {"kind": "rhmc", "regulator": "none", "high_reward": "team", "filter": "off"}
+    settled = {"kind": "rhmc", "regulator": "none", "coordinator.reward": "team", "filter": "off"}
     study = tiny(arms={"free": setting(**settled)})
     (item,) = items(study)
     trainer = Trainer(item.spec.env, item.spec.algo, item.spec.trainer, item.spec.seed)

@@ -222,7 +222,7 @@ def test_status_for_scripts(rhmc: Rhmc) -> None:
 
 
 def test_every_verb_of_studies_takes_a_variant(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> None:
-    Path("studies/x.yaml").write_text(STUDY + "variants: {large: {algo: {hidden: 128}}}\n")
+    Path("studies/x.yaml").write_text(STUDY + "variants: {large: {algo: {hidden_dim: 128}}}\n")
     names: list[str] = []
     monkeypatch.setattr("pipelines.execution.run.run_studies", lambda studies, home: names.append(studies[0].name) or 0)
     for place in ("execution.run.show_status", "export.tables.export_study"):
@@ -286,7 +286,7 @@ def test_what_is_wrong_with_several_studies_is_said_at_once(rhmc: Rhmc, tmp_path
 
 
 def test_what_is_wrong_with_an_option_names_the_study_unless_it_is_wrong_for_all(rhmc: Rhmc) -> None:
-    Path("studies/y.yaml").write_text(STUDY + "variants: {large: {algo: {hidden: 128}}}\n")
+    Path("studies/y.yaml").write_text(STUDY + "variants: {large: {algo: {hidden_dim: 128}}}\n")
     words = ["studies/x.yaml", "studies/y.yaml"]
     said = rhmc("study", "run", *words, "--variant", "large")
     assert said == (2, "", "studies/x.yaml: --variant: 'large' is not allowed; this study has no variants\n")

@@ -379,7 +379,7 @@ def test_a_run_that_diverges_looks_failed_everywhere(
 ) -> None:
     monkeypatch.setattr(ray_driver, "ray_session", lambda *args: nullcontext([]))
     monkeypatch.setattr(ray_driver, "fit", fit_here)
-    study = tiny(arms={"calm": setting(lr=1e-3), "wild": setting(lr=1e6, warmup=0)})
+    study = tiny(arms={"calm": setting(lr=1e-3), "wild": setting(lr=1e6, learning_starts=0)})
     assert run_studies([study], home) == 1
     said = capsys.readouterr().out
     (line,) = [line for line in said.splitlines() if line.startswith("failed: ")]

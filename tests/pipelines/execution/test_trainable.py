@@ -31,6 +31,7 @@ from pipelines.workspace.work_folder import (
 )
 from rhmc.algorithms import ALGORITHMS
 from rhmc.training.trainer import Trainer
+from tests.blocks import fitted, nested
 from tests.pipelines.support import setting, spec
 from tests.robustness.chaos import DAMAGES, damaged
 
@@ -339,8 +340,8 @@ def test_statistics_that_are_not_finite_are_not_kept(start: Start, tmp_path: Pat
     run.step()
     trainer = run.trainer
     assert isinstance(trainer, Trainer)
-    trainer.algorithm.standard.sums[2] = math.inf  # type: ignore[attr-defined]
-    with pytest.raises(DivergedError, match=r"^diverged: algorithm\.standard\.sums is inf at step 0; "):
+    trainer.algorithm.standardiser.sums[2] = math.inf  # type: ignore[attr-defined]
+    with pytest.raises(DivergedError, match=r"^diverged: algorithm\.standardiser\.sums is inf at step 0; "):
         run._save(trainer)
     assert not (tmp_path / "a" / "run0").exists()
 
@@ -360,7 +361,7 @@ def test_a_diverged_run_diverges_again_where_it_did(
 
 def test_a_step_size_that_diverges(start: Start, tmp_path: Path) -> None:
     """Nothing is patched here: the weights grow until the loss overflows."""
-    one = spec(lr=1e6, warmup=0)
+    one = spec(lr=1e6, learning_starts=0)
     fixed = {"key": "wild", "spec": one.canonical(), "folder": str(tmp_path / "wild"), "stop": str(tmp_path / "stop")}
     run = RunTrainable({"job": fixed | {"checkpoint_every": 1}})
     last = finish(run)[-1]
@@ -371,9 +372,9 @@ def test_a_step_size_that_diverges(start: Start, tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ALGORITHMS)
 def test_every_method_is_finite_at_every_point_and_each_of_its_networks_is_looked_at(kind: str) -> None:
     """With the settings under which some value is infinite or undefined although nothing is wrong."""
-    few = {"hidden": 4, "batch": 8, "batch_h": 8, "warmup": 0, "steps_per_update": 4, "rollout": 1, "pretrain": 32}
+    few = {"hidden_dim": 4, "batch_size": 8, "learning_starts": 0, "train_freq": 4, "n_steps": 1, "pretrain": 32}
     config = ALGORITHMS[kind].config
-    algo = config.model_validate({"kind": kind} | {k: v for k, v in few.items() if k in config.model_fields})
+    algo = config.model_validate({"kind": kind} | nested(fitted(config, few)))
     if "regulator" in config.model_fields:
         algo = algo.model_copy(update={"regulator": "none"})
     one = setting().model_copy(update={"algo": algo})
@@ -381,7 +382,7 @@ def test_every_method_is_finite_at_every_point_and_each_of_its_networks_is_looke
     for point in trainer:
         check(defined(point), trainer.state_dict())
     for learner in trainer.algorithm.learners():
-        for part in (learner.net, learner.slow):
+        for part in (learner.net, learner.target_net):
             for weight in part.parameters():
                 before = weight.detach().clone()
                 weight.data.view(-1)[-1] = math.nan
@@ -430,7 +431,7 @@ def test_a_kept_policy_holds_nothing_that_learning_kept() -> None:
 @pytest.mark.parametrize("kind", ALGORITHMS)
 def test_no_method_keeps_its_half_rollout(kind: str) -> None:
     """The policy of an untrained and of a trained run hold the same tensors but for the task's own state."""
-    config = {"kind": kind, "hidden": 8}
+    config = {"kind": kind, "hidden_dim": 8}
     one = setting().model_copy(update={"algo": ALGORITHMS[kind].config.model_validate(config)})
     trainer = Trainer(one.env, one.algo, one.trainer, 0)
     next(trainer)

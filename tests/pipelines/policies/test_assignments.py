@@ -12,19 +12,29 @@ from pipelines.policies import assignments
 from pipelines.policies.assignments import Watch, counts, export_assignments, rows_of, watched
 from pipelines.specs.study import Study
 from pipelines.workspace.errors import InputError
+from rhmc.algorithms import ALGORITHMS
 from rhmc.hierarchy.theorem import smallest_counterexample
 from rhmc.training.trainer import Trainer
 from rhmc.types import Local, Obs, Transition
+from tests.blocks import fitted, nested
 from tests.pipelines.support import jobs_of, setting, tiny
 
 
 def rhmc_study() -> Study:
     """RHMC, HiT-MAC and IQL, one seed, a second of training."""
-    algo: dict[str, Any] = {"warmup": 64, "batch": 32, "steps_per_update": 16, "hidden": 8, "buffer": 400}
+    algo: dict[str, Any] = {
+        "learning_starts": 64,
+        "batch_size": 32,
+        "train_freq": 16,
+        "hidden_dim": 8,
+        "buffer_size": 400,
+    }
     base = setting()
     arms = {
-        name: type(base).model_validate(base.model_dump() | {"algo": {"kind": name, **own}})
-        for name, own in (("rhmc", algo), ("hitmac", {"hidden": 8, "pretrain": 200}), ("iql", algo))
+        name: type(base).model_validate(
+            base.model_dump() | {"algo": {"kind": name} | nested(fitted(ALGORITHMS[name].config, own))}
+        )
+        for name, own in (("rhmc", algo), ("hitmac", {"hidden_dim": 8, "pretrain": 200}), ("iql", algo))
     }
     return tiny(arms=arms)
 

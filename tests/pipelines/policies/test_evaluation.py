@@ -29,7 +29,7 @@ def final(point: Metrics) -> Metrics:
 
 
 def of_kind(kind: str, encoder: str) -> RunSpec:
-    fields = {"kind": kind, "encoder": encoder, "hidden": 8}
+    fields = {"kind": kind, "encoder": encoder, "hidden_dim": 8}
     one = setting().model_copy(update={"algo": ALGORITHMS[kind].config.model_validate(fields)})
     budget = one.trainer.model_copy(update={"steps": 64, "evaluations": 1})
     return RunSpec(**dict(one.model_copy(update={"trainer": budget})), seed=1)

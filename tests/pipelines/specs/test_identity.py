@@ -14,12 +14,14 @@ from hypothesis import strategies as st
 from pydantic.fields import FieldInfo
 
 from pipelines.specs import identity
+from pipelines.specs.document import settings as of_config
 from pipelines.specs.identity import TRAINER, code_id, combined, fingerprint, folder_of, modules
 from pipelines.specs.study import TABLES, RunSpec
 from pipelines.specs.syntax import Code
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import ENVS
 from rhmc.training.trainer import Config as TrainerConfig
+from tests.blocks import fields, nested
 
 ROOT = Path(__file__).parents[3]
 PLACES = [(method, task) for method in ALGORITHMS for task in ENVS]
@@ -357,9 +359,7 @@ CONFIGS = [
     *(("algo", kind, config) for kind, config in TABLES["algo"].items()),
     ("trainer", "", TrainerConfig),
 ]
-FIELDS = [
-    (section, kind, field) for section, kind, config in CONFIGS for field in config.model_fields if field != "kind"
-]
+FIELDS = [(section, kind, field) for section, kind, config in CONFIGS for field in fields(config) if field != "kind"]
 
 
 def other(field: FieldInfo) -> list[Any]:
@@ -383,11 +383,14 @@ def other(field: FieldInfo) -> list[Any]:
 def spec(section: str = "trainer", kind: str = "", **changed: Any) -> RunSpec:
     """A run with defaults but for the fields given."""
     parts: dict[str, Any] = {"env": {"kind": "coverage"}, "algo": {"kind": "iql"}, "trainer": {}}
-    parts[section] = ({"kind": kind} if kind else {}) | changed
+    parts[section] = ({"kind": kind} if kind else {}) | nested(changed)
     return RunSpec.model_validate(parts | {"seed": 0})
 
 
-BESIDE = {"regulator": {"high_reward": "assigned"}, "high_reward": {"regulator": "none"}}  # what a value needs
+BESIDE = {  # what a value needs
+    "regulator": {"coordinator.reward": "assigned"},
+    "coordinator.reward": {"regulator": "none"},
+}
 
 
 @pytest.mark.parametrize(("section", "kind", "field"), FIELDS)
@@ -395,7 +398,7 @@ def test_another_value_of_any_field_is_another_run(section: str, kind: str, fiel
     config = next(c for s, k, c in CONFIGS if (s, k) == (section, kind))
     beside = {} if section != "algo" or kind != "rhmc" else BESIDE.get(field, {})
     tried = []
-    for value in other(config.model_fields[field]):
+    for value in other(of_config(config)[field]):
         try:
             tried.append(spec(section, kind, **beside, **{field: value}).id)
         except ValueError:

@@ -20,6 +20,7 @@ from rhmc.algorithms import ALGORITHMS
 from rhmc.learning.learner import Learner
 from rhmc.training import trainer
 from rhmc.training.trainer import Trainer
+from tests.blocks import fitted, nested
 from tests.pipelines.support import setting, tiny
 
 ROOT = Path(__file__).parents[3]
@@ -71,7 +72,7 @@ STUDY: dict[str, Any] = {
     "question": "What is allowed?",
     "base": {
         "env": {"kind": "coverage", "agents": 2, "targets": 13},
-        "algo": {"kind": "rhmc", "warmup": 0},
+        "algo": {"kind": "rhmc", "learning_starts": 0},
         "trainer": {"num_envs": 16},
     },
     "arms": {"full": {}},
@@ -127,7 +128,10 @@ def test_spaces_and_trials_of_a_search_have_bounds_too() -> None:
     for change, text in (
         ("trials=1e9", r"trials: 1000000000 is not allowed; must be at most 100,000$"),
         ("arms.RHMC.space.lr={low: 1e-4, high: 1e12}", r"space\.lr\.high: 1000000000000 is not allowed; must be at"),
-        ("arms.RHMC.space.hidden={choices: [64, 1e6]}", r"space\.hidden\.choices\.1: 1000000 is not allowed; must be"),
+        (
+            "arms.RHMC.space.hidden_dim={choices: [64, 1e6]}",
+            r"space\.hidden_dim\.choices\.1: 1000000 is not allowed; must be",
+        ),
         ("sampler.seed=1e15", r"sampler\.seed: 1000000000000000 is not allowed; must be at most 1,000,000,000,000$"),
     ):
         with pytest.raises(StudyError, match=text):
@@ -180,25 +184,24 @@ def test_numbers_in_options_have_bounds(words: list[str]) -> None:
 
 
 FEW: dict[str, Any] = {
-    "hidden": 2,
-    "batch": 4,
-    "batch_h": 4,
-    "buffer": 100,
-    "warmup": 25,
-    "steps_per_update": 7,
-    "rollout": 4,
+    "hidden_dim": 2,
+    "batch_size": 4,
+    "buffer_size": 100,
+    "learning_starts": 25,
+    "train_freq": 7,
+    "n_steps": 4,
     "epochs": 1,
     "minibatches": 1,
     "pretrain": 50,
 }
 VARIANTS: list[dict[str, Any]] = [
     {},
-    {"warmup": 0, "rollout": 1, "pretrain": 9, "steps_per_update": 1},
-    {"assignment_period": 3, "coordinator_every": 4},
-    {"assignment_period": 100, "warmup": 0, "pretrain": 32},
-    {"assignment_period": 10, "rollout": 9, "pretrain": 40},
-    {"pretrain": 20, "executor": "expected"},
-    {"pretrain": 0, "high_reward": "team", "regulator": "none"},
+    {"learning_starts": 0, "n_steps": 1, "pretrain": 9, "train_freq": 1},
+    {"assignment_period": 3, "coordinator.update_every": 4},
+    {"assignment_period": 100, "learning_starts": 0, "pretrain": 32},
+    {"assignment_period": 10, "n_steps": 9, "pretrain": 40},
+    {"pretrain": 20, "executor.method": "expected"},
+    {"pretrain": 0, "coordinator.reward": "team", "regulator": "none"},
 ]
 TASKS: dict[str, dict[str, Any]] = {
     "coverage": {"kind": "coverage", "agents": 2, "targets": 2},
@@ -207,8 +210,7 @@ TASKS: dict[str, dict[str, Any]] = {
 
 
 def few(kind: str, task: str, variant: dict[str, Any], steps: int = 1) -> Setting:
-    known = ALGORITHMS[kind].config.model_fields
-    algo = {"kind": kind} | {name: value for name, value in (FEW | variant).items() if name in known}
+    algo = {"kind": kind} | nested(fitted(ALGORITHMS[kind].config, FEW | variant))
     fixed = {"num_envs": 3, "steps": steps}
     return Setting.model_validate({"env": TASKS[task], "algo": algo, "trainer": fixed})
 
@@ -261,13 +263,13 @@ def test_every_arm_of_the_studies_at_hand_learns(path: Path, profile: str) -> No
 
 
 def test_the_check_names_the_arms_and_the_least_budget(file: Path) -> None:
-    arms = "arms={b: {algo: {kind: mappo, encoder: mlp, rollout: 201}}, c: {algo: {warmup: 4000}}}"
+    arms = "arms={b: {algo: {kind: mappo, encoder: mlp, n_steps: 201}}, c: {algo: {learning_starts: 4000}}}"
     done = CliRunner().invoke(app, ["study", "check", str(file), "--set", arms])
     assert done.exit_code == 0
     notes = [line for line in done.stdout.splitlines() if line.startswith("note: ")]
     assert notes == [
-        f"note: {file}:15:8: steps: 3,200 steps end before 'mappo' learns; must be at least 3,216 (rollout 201 x "
+        f"note: {file}:15:8: steps: 3,200 steps end before 'mappo' learns; must be at least 3,216 (n_steps 201 x "
         "num_envs 16) (in arm 'b')",
-        f"note: {file}:15:8: steps: 3,200 steps end before 'rhmc' learns; must be at least 4,064 (warmup 4,000 + "
-        "steps_per_update 64) (in arm 'c')",
+        f"note: {file}:15:8: steps: 3,200 steps end before 'rhmc' learns; must be at least 4,064 (learning_starts "
+        "4,000 + train_freq 64) (in arm 'c')",
     ]

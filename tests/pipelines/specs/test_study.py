@@ -77,7 +77,7 @@ def test_a_profile_changes_single_arms() -> None:
     assert paper.arms == load(GOOD, "paper").arms
     assert {name for name in quick.arms if quick.arms[name] != load(GOOD).arms[name]} == {"IQL"}
     assert (quick.arms["IQL"].algo.lr, quick.arms["IQL"].env.agents) == (0.5, 3)
-    assert quick.arms["IQL"].algo.batch == paper.arms["IQL"].algo.batch
+    assert quick.arms["IQL"].algo.batch_size == paper.arms["IQL"].algo.batch_size
     over = load(text, "quick", "arms.IQL.algo.lr=0.25")
     assert (over.arms["IQL"].algo.lr, over.arms["IQL"].env.agents) == (0.25, 3)
     assert load(text, "quick", "profiles.quick.changes.IQL.algo.lr=0.125").arms["IQL"].algo.lr == 0.125
@@ -342,7 +342,8 @@ def test_faulty_grids(old: str, new: str, said: list[str]) -> None:
 
 
 def test_a_grid_too_large_to_train_is_refused_before_it_is_spelled_out() -> None:
-    keys = "algo.lr", "algo.alpha", "algo.gamma_h", "algo.gamma_l", "algo.epsilon", "algo.flip", "algo.polyak"
+    keys = "algo.lr", "algo.alpha", "algo.coordinator.gamma", "algo.executor.gamma", "algo.executor.epsilon"
+    keys += "algo.coordinator.assignment_epsilon", "algo.tau"
     values = ", ".join(f"0.{i}" for i in range(10, 90))
     text = GRID.replace("  env.agents: [2, 4]\n", "").replace("  algo.lr: [1e-3, 5e-5]\n", "")
     text = text.replace("grid:\n", "grid:\n" + "".join(f"  {key}: [{values}]\n" for key in keys))
@@ -473,7 +474,7 @@ PARTS = [
     (
         "iql, encoder: pairwise",
         "iql, encoder: pairwise, horizon: 2",
-        ["9:46: arms.IQL.algo.horizon: unknown key 'horizon'; allowed: buffer, batch, ...epsilon_steps, kind"],
+        ["9:46: arms.IQL.algo.horizon: unknown key 'horizon'; allowed: buffer_size, ...epsilon_steps, kind"],
     ),
     # values
     ("regulator: none", "regulator: papr", ["8:23: arms.none.algo.regulator: 'papr' is not allowed; ... 'paper'?"]),

@@ -33,7 +33,7 @@ def run(kind: str, env: dict[str, Any] = COVERAGE) -> RunSpec:
     """A run of few copies."""
     trainer = {"steps": 40, "num_envs": 4, "evaluations": 1}
     return RunSpec.model_validate(
-        {"env": env, "algo": {"kind": kind, "hidden": 8, **HELD.get(kind, {})}, "trainer": trainer, "seed": 5}
+        {"env": env, "algo": {"kind": kind, "hidden_dim": 8, **HELD.get(kind, {})}, "trainer": trainer, "seed": 5}
     )
 
 

@@ -34,10 +34,10 @@ def test_modules_settings_arms_and_seeds_are_told_apart() -> None:
     tracker = MemoryTracker(CARD, [])
     code = dict(slow.card.modules)
     log(tracker, slow, code | {"rhmc.algorithms.qlearning": "other", "rhmc.gone": "digest"})
-    log(tracker, changed(fast, gamma=0.5, hidden=17), code)
+    log(tracker, changed(fast, gamma=0.5, hidden_dim=17), code)
     assert reasons(items(STUDY), tracker.recorded(), tracker) == [
         "stale: arm 'slow', 1 run: changed since: rhmc.algorithms.qlearning, rhmc.gone",
-        "stale: arm 'fast', 1 run: other settings: algo.gamma was 0.5, now 0.99, algo.hidden was 17, now 64",
+        "stale: arm 'fast', 1 run: other settings: algo.gamma was 0.5, now 0.99, algo.hidden_dim was 17, now 64",
     ]
     assert reasons(items(STUDY), [], tracker) == []
 
@@ -69,14 +69,14 @@ def test_runs_of_one_reason_are_one_line_and_many_settings_are_cut() -> None:
     study = tiny(arms={"one": setting()}).model_copy(update={"seeds": 3})
     tracker = MemoryTracker(study_card(study), [])
     for item in items(study):
-        log(tracker, changed(item, gamma=0.5, hidden=17, batch=31, buffer=401, warmup=65))
+        log(tracker, changed(item, gamma=0.5, hidden_dim=17, batch_size=31, buffer_size=401, learning_starts=65))
     (line,) = reasons(items(study), tracker.recorded(), tracker)
-    assert line.startswith("stale: arm 'one', 3 runs: other settings: algo.batch was 31, now 32, ")
+    assert line.startswith("stale: arm 'one', 3 runs: other settings: algo.batch_size was 31, now 32, ")
     assert line.endswith(" and 1 more")
     tracker = MemoryTracker(study_card(study), [])
     log(tracker, changed(items(study)[0], gamma=0.5, hidden=17, batch=31, buffer=401))
     (line,) = reasons(items(study), tracker.recorded(), tracker)
-    assert line.endswith("algo.hidden was 17, now 16"), "all four are named"
+    assert line.endswith("algo.hidden_dim was 17, now 16"), "all four are named"
 
 
 def test_mlflow_keeps_the_list(home: Path) -> None:

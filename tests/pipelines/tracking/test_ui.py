@@ -154,7 +154,7 @@ def test_what_varies_is_told_by_method() -> None:
 
 def of_kind(kind: str, **algo: Any) -> Setting:
     """The tiny task with another method."""
-    config = ALGORITHMS[kind].config.model_validate({"kind": kind, "warmup": 64, "batch": 32, **algo})
+    config = ALGORITHMS[kind].config.model_validate({"kind": kind, "learning_starts": 64, "batch_size": 32, **algo})
     return setting().model_copy(update={"algo": config})
 
 

@@ -50,7 +50,7 @@ GOOD = """\
 question: Which?
 base:
   env: {kind: coverage, agents: 2, targets: 2}
-  algo: {kind: iql, warmup: 64, batch: 32, steps_per_update: 16, hidden: 16, buffer: 400}
+  algo: {kind: iql, learning_starts: 64, batch_size: 32, train_freq: 16, hidden_dim: 16, buffer_size: 400}
   trainer: {num_envs: 8, evaluations: 3, eval_episodes: 4, final_episodes: 8}
 arms:
   IQL:
@@ -58,11 +58,11 @@ arms:
       lr: {low: 1e-4, high: 1e-2, log: true}
       gamma: {low: 0.5, high: 0.9}
   VDN:
-    algo: {kind: vdn, warmup: 64, batch: 32, steps_per_update: 16, hidden: 16, buffer: 400}
+    algo: {kind: vdn, learning_starts: 64, batch_size: 32, train_freq: 16, hidden_dim: 16, buffer_size: 400}
     space:
       lr: {low: 1e-4, high: 1e-2, log: true}
-      batch: {low: 16, high: 32}
-      double: {choices: [true, false]}
+      batch_size: {low: 16, high: 32}
+      double_q: {choices: [true, false]}
 trials: {quick: 5, paper: 9}
 seeds: 2
 steps: 600
@@ -184,25 +184,25 @@ LR = "lr: {low: 1e-4, high: 1e-2, log: true}\n      gamma"
             "9: arms.IQL.space.lr.low: 0 is not allowed; must be above 0 where log is true",
         ),
         (LR, LR.replace("1e-4", "tiny"), "9: arms.IQL.space.lr.low: 'tiny' is not allowed; must be a valid number"),
-        ("low: 16", "low: 16.5", "15: arms.VDN.space.batch.low: 16.5 is not allowed; must be a valid integer"),
+        ("low: 16", "low: 16.5", "15: arms.VDN.space.batch_size.low: 16.5 is not allowed; must be a valid integer"),
         (
             "high: 32",
             "high: 32, step: 0.5",
-            "15: arms.VDN.space.batch.step: 0.5 is not allowed; must be a whole number",
+            "15: arms.VDN.space.batch_size.step: 0.5 is not allowed; must be a whole number",
         ),
         (
             "high: 32",
             "high: 32, step: 5",
-            "15: arms.VDN.space.batch.high: 32 is not allowed; must be low and a whole*",
+            "15: arms.VDN.space.batch_size.high: 32 is not allowed; must be low and a whole*",
         ),
         (
             "[true, false]",
             "[true, 3]",
-            "16: arms.VDN.space.double.choices.1: 3 is not allowed; must be a valid boolean",
+            "16: arms.VDN.space.double_q.choices.1: 3 is not allowed; must be a valid boolean",
         ),
-        ("[true, false]", "[true, true]", "16: arms.VDN.space.double.choices: one is there twice"),
-        ("[true, false]", "[]", "16: arms.VDN.space.double.choices: [] is not allowed; must not be empty"),
-        ("{choices: [true, false]}", "yes", "16: arms.VDN.space.double: 'yes' is not allowed; must be a mapping"),
+        ("[true, false]", "[true, true]", "16: arms.VDN.space.double_q.choices: one is there twice"),
+        ("[true, false]", "[]", "16: arms.VDN.space.double_q.choices: [] is not allowed; must not be empty"),
+        ("{choices: [true, false]}", "yes", "16: arms.VDN.space.double_q: 'yes' is not allowed; must be a mapping"),
         ("quick: 5", "quick: 0", "17: trials.quick: 0 is not allowed; must be greater than or equal to 1"),
         (
             "trials: {quick: 5, paper: 9}",
@@ -238,10 +238,10 @@ def test_a_fault_names_the_column_of_the_value() -> None:
 
 
 def test_a_combination_that_the_method_refuses_is_found_in_the_check() -> None:
-    space = "{regulator: {choices: [none, exact]}, high_reward: {choices: [assigned, team]}}"
+    space = "{regulator: {choices: [none, exact]}, coordinator.reward: {choices: [assigned, team]}}"
     arm = f"  RHMC: {{algo: {{kind: rhmc}}, space: {space}}}\n"
     with pytest.raises(
-        StudyError, match=r"7:\d+: arms.RHMC.space: 'rhmc' refuses regulator='exact', high_reward='team': "
+        StudyError, match=r"7:\d+: arms.RHMC.space: 'rhmc' refuses regulator='exact', coordinator.reward='team': "
     ):
         load(changed("arms:\n", f"arms:\n{arm}"))
     load(changed("arms:\n", f"arms:\n{arm}".replace("[none, exact]", "[none]")))
@@ -659,12 +659,12 @@ def test_the_winner_says_where_it_comes_from_and_a_study_includes_it(tmp_path: P
     assert str(tmp_path) not in written.winners[0].read_text()
     Path("studies/use.yaml").write_text(
         "question: Which?\nbase: {env: {kind: coverage}, algo: {include: found/search_x.iql.quick.yaml}}\n"
-        "arms:\n  found: {}\n  more: {algo: {hidden: 32}}\n"
+        "arms:\n  found: {}\n  more: {algo: {hidden_dim: 32}}\n"
         "  VDN: {algo: {include: found/search_x.vdn.quick.yaml, gamma: 0.5}}\nseeds: 1\nsteps: 100\n"
     )
     arms = Study.load("studies/use.yaml").arms
     assert arms["found"].algo == search.arms["IQL"].at(best.params).algo
-    assert (arms["more"].algo.lr, arms["more"].algo.hidden) == (best.params["lr"], 32)
+    assert (arms["more"].algo.lr, arms["more"].algo.hidden_dim) == (best.params["lr"], 32)
     assert (arms["VDN"].algo.kind, arms["VDN"].algo.gamma) == ("vdn", 0.5)
 
 
@@ -692,10 +692,10 @@ def test_a_dimension_is_offered_whole_or_not(tmp_path: Path) -> None:
     world.launch()
     (_, vdn) = world.ledgers()
     for trial in vdn.latest().values():
-        assert isinstance(trial.params["batch"], int)
-        assert 16 <= trial.params["batch"] <= 32
+        assert isinstance(trial.params["batch_size"], int)
+        assert 16 <= trial.params["batch_size"] <= 32
         assert 1e-4 <= trial.params["lr"] <= 1e-2
-        assert trial.params["double"] in (True, False)
+        assert trial.params["double_q"] in (True, False)
     assert str(Dimension(low=16, high=32, step=4)) == "16 to 32, step 4"
 
 
@@ -768,8 +768,8 @@ def test_check_prints_spaces_and_budget(rhmc: Rhmc, project: Path) -> None:
     lines = out.splitlines()
     assert lines[:4] == ["search_x (quick): Which?", "IQL: iql", "  lr: 0.0001 to 0.01, log", "  gamma: 0.5 to 0.9"]
     assert lines[6:] == [
-        "  batch: 16 to 32",
-        "  double: {true, false}",
+        "  batch_size: 16 to 32",
+        "  double_q: {true, false}",
         "each arm: 7 trials x 2 seeds x 600 environment steps, 8,400 in all; "
         "sampler tpe, pruner none, 2 trials at a time",
     ]

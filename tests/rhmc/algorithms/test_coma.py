@@ -32,13 +32,13 @@ def _seed() -> None:
 def method(**changes: Any) -> COMA:
     """Without exploration beyond the policy, standardised rewards or scaled advantages, unless asked for."""
     plain = {
-        "worth": "critic",
-        "hidden": 8,
+        "advantage_estimator": "critic",
+        "hidden_dim": 8,
         "standardise": "none",
         "scale": False,
         "epsilon": 0.0,
     }
-    return COMA(Config(**plain | {"gamma": 0.5, "lam": 0.5, "entropy": 0.0} | changes), SPEC, 2, seeded())
+    return COMA(Config(**plain | {"gamma": 0.5, "td_lambda": 0.5, "ent_coef": 0.0} | changes), SPEC, 2, seeded())
 
 
 def observation(batch: int = 1) -> Obs:
@@ -127,21 +127,21 @@ def judged(algo: COMA, policy: list[float], q: list[float], *steps: Transition) 
     """Returns and advantages of a rollout acted by one policy and judged by one critic, whatever is seen."""
     constant(algo.actor.net, [0.0, 0.0, 0.0])  # what the policy has become since does not count along the rollout
     constant(algo.critic.net, [77.0, 33.0, 11.0])  # nor does the critic that learns
-    constant(algo.critic.slow, q)
+    constant(algo.critic.target_net, q)
     chance = torch.tensor(policy).expand(len(steps[0].reward), N, ACTIONS)
     return algo._judged(whole(algo, *(t._replace(extra={"chance": chance}) for t in steps)))
 
 
 @pytest.mark.parametrize("encoder", ["mlp", "pairwise"])
 def test_the_critics_advantage_by_hand(encoder: str) -> None:
-    algo = method(encoder=encoder, rollout=1)
+    algo = method(encoder=encoder, n_steps=1)
     _, advantage = judged(algo, [0.5, 0.25, 0.25], [1.0, 2.0, 4.0], transition(algo, [[0, 1], [2, 2]]))
     assert advantage.tolist() == [[[-1.0, 0.0], [2.0, 2.0]]]
 
 
 def test_the_returns_advantage_by_hand() -> None:
     """The last reward is 4, then the present policy, uniform, is worth 20/3; the one that acted was worth 5."""
-    algo = method(rollout=2, worth="return")
+    algo = method(n_steps=2, advantage_estimator="return")
     steps = (transition(algo, [[0, 1]], 2.0), transition(algo, [[1, 1]], 4.0))
     target, advantage = judged(algo, [0.5, 0.25, 0.25], [0.0, 8.0, 12.0], *steps)
     last = 4 + (8 + 12) / 3 / 2
@@ -152,7 +152,7 @@ def test_the_returns_advantage_by_hand() -> None:
 
 @pytest.mark.parametrize("worth", ["critic", "return"])
 def test_scaled_advantages_have_mean_0_and_deviation_1_and_keep_their_order(worth: str) -> None:
-    algo = method(rollout=1, worth=worth, scale=True)
+    algo = method(n_steps=1, advantage_estimator=worth, scale=True)
     steps = transition(algo, [[0, 1], [1, 1], [2, 0]], reward=1.0)
     _, advantage = judged(
         algo, [0.5, 0.25, 0.25], [1.0, 2.0, 6.0], steps._replace(reward=torch.tensor([1.0, 2.0, 4.0]))
@@ -162,7 +162,7 @@ def test_scaled_advantages_have_mean_0_and_deviation_1_and_keep_their_order(wort
     best, worst = {"critic": ([0, 2, 0], [0, 0, 0]), "return": ([0, 2, 1], [0, 0, 1])}[worth]
     assert advantage[tuple(best)] == advantage.max()
     assert advantage[tuple(worst)] == advantage.min()
-    alike = method(rollout=1, worth=worth, scale=True)
+    alike = method(n_steps=1, advantage_estimator=worth, scale=True)
     _, advantage = judged(alike, [0.5, 0.25, 0.25], [1.0, 1.0, 1.0], transition(alike, [[0, 1], [1, 1]]))
     assert torch.isfinite(advantage).all()
 
@@ -195,9 +195,9 @@ def test_an_agents_action_values_see_the_others_actions_and_not_its_own(encoder:
     ],
 )
 def test_targets_by_hand(encoder: str, middle: str, want: list[float]) -> None:
-    algo = method(encoder=encoder, rollout=3)
+    algo = method(encoder=encoder, n_steps=3)
     constant(algo.actor.net, [0.0, 0.0, -1e9])
-    constant(algo.critic.slow, [4.0, 8.0, 500.0])
+    constant(algo.critic.target_net, [4.0, 8.0, 500.0])
     constant(algo.critic.net, [77.0, 77.0, 77.0])
     steps = [transition(algo, [[0, 1]], r, after) for r, after in ((1.0, "going"), (2.0, middle), (4.0, "going"))]
     assert algo._judged(whole(algo, *steps))[0][:, 0].tolist() == [[x, x] for x in want]
@@ -214,9 +214,9 @@ def test_targets_by_hand(encoder: str, middle: str, want: list[float]) -> None:
 def test_others_next_actions_are_those_taken_but_the_policys_where_nothing_was_taken(
     first: str, want: list[list[float]]
 ) -> None:
-    algo = method(rollout=2, lam=0.0)
+    algo = method(n_steps=2, td_lambda=0.0)
     constant(algo.actor.net, [-1e9, -1e9, 0.0])
-    others_action(algo.critic.slow, 1.0)
+    others_action(algo.critic.target_net, 1.0)
     steps = (transition(algo, [[2, 2]], after=first), transition(algo, [[1, 0]]))
     assert algo._judged(whole(algo, *steps))[0][:, 0].tolist() == want
 
@@ -225,7 +225,7 @@ def test_standardised_rewards_make_the_scale_of_the_task_irrelevant() -> None:
     targets = []
     for scale, shift in ((1.0, 0.0), (10.0, 40.0)):
         torch.manual_seed(1)
-        algo = method(rollout=3, standardise="reward")
+        algo = method(n_steps=3, standardise="reward")
         targets.append(
             algo._judged(whole(algo, *(transition(algo, [[0, 1]], scale * r + shift) for r in (1, 2, 4))))[0]
         )
@@ -233,17 +233,17 @@ def test_standardised_rewards_make_the_scale_of_the_task_irrelevant() -> None:
 
 
 def test_standardised_returns_give_the_critics_outputs_their_scale() -> None:
-    algo = method(rollout=1, standardise="return")
-    algo.standard.sums = torch.tensor([1.0, 10.0, 104.0])  # mean 10, deviation 2
-    constant(algo.critic.slow, [6.0, 6.0, 6.0])
+    algo = method(n_steps=1, standardise="return")
+    algo.standardiser.sums = torch.tensor([1.0, 10.0, 104.0])  # mean 10, deviation 2
+    constant(algo.critic.target_net, [6.0, 6.0, 6.0])
     target, _ = algo._judged(whole(algo, transition(algo, [[0, 1]], 4.0)))
     assert target.flatten().tolist() == pytest.approx([15.0, 15.0])  # 4 + (6 * 2 + 10)/2
-    assert algo.standard.target(target).flatten().tolist() == pytest.approx([2.5, 2.5])
+    assert algo.standardiser.target(target).flatten().tolist() == pytest.approx([2.5, 2.5])
 
 
 def test_what_the_critic_learns_is_standardised_by_the_returns_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     """These count as seen before they are a target: the first rollout's have mean 0 and deviation 1 themselves."""
-    algo, seen = method(rollout=2, standardise="return", minibatches=1, epochs=1), []
+    algo, seen = method(n_steps=2, standardise="return", minibatches=1, epochs=1), []
     real = algo._critic_loss
 
     def spy(rows: Batch) -> Any:
@@ -260,7 +260,7 @@ def test_what_the_critic_learns_is_standardised_by_the_returns_seen(monkeypatch:
 
 @pytest.mark.parametrize("standardise", ["reward", "return"])
 def test_a_checkpoint_holds_what_was_seen_and_the_half_of_a_rollout(standardise: str) -> None:
-    first, other = (method(rollout=2, standardise=standardise) for _ in range(2))
+    first, other = (method(n_steps=2, standardise=standardise) for _ in range(2))
     steps = [transition(first, [[0, 1], [1, 2]], reward) for reward in (5.0, 1.0, 7.0, 3.0, 9.0)]
     for t in steps[:3]:
         first.observe(t)
@@ -275,7 +275,7 @@ def test_a_checkpoint_holds_what_was_seen_and_the_half_of_a_rollout(standardise:
 
 
 def test_the_critic_learns_the_value_of_the_action_taken() -> None:
-    algo = method(rollout=1)
+    algo = method(n_steps=1)
     bias = constant(algo.critic.net, [1.0, 2.0, 4.0])
     rows = flat(whole(algo, transition(algo, [[0, 2]]))) | {"target": torch.tensor([[3.0, 3.0]])}
     loss, _ = algo._critic_loss(rows)
@@ -290,7 +290,7 @@ def test_the_critic_learns_the_value_of_the_action_taken() -> None:
 @pytest.mark.parametrize("epsilon", [0.0, 0.5])
 def test_the_policy_gradient_by_hand(epsilon: float) -> None:
     """A uniform policy: every logit moves by advantage x (1 if taken - 1/3), the softmax's share of it with a floor."""
-    algo = method(rollout=1, epsilon=epsilon)
+    algo = method(n_steps=1, epsilon=epsilon)
     bias = constant(algo.actor.net, [0.0, 0.0, 0.0])
     rows = flat(whole(algo, transition(algo, [[0, 2]]))) | {"advantage": torch.tensor([[6.0, -12.0]])}
     loss, _ = algo._actor_loss(rows)
@@ -300,7 +300,7 @@ def test_the_policy_gradient_by_hand(epsilon: float) -> None:
 
 
 def test_the_entropy_bonus_draws_towards_the_uniform_policy() -> None:
-    algo = method(rollout=1, entropy=2.0)
+    algo = method(n_steps=1, ent_coef=2.0)
     bias = constant(algo.actor.net, [1.0, 0.0, 0.0])
     rows = flat(whole(algo, transition(algo, [[0, 2]]))) | {"advantage": torch.zeros(1, N)}
     loss, logs = algo._actor_loss(rows)
@@ -315,7 +315,7 @@ def test_the_entropy_bonus_draws_towards_the_uniform_policy() -> None:
 
 
 def test_a_certain_policy_has_finite_gradients() -> None:
-    algo = method(rollout=1, entropy=1.0)
+    algo = method(n_steps=1, ent_coef=1.0)
     bias = constant(algo.actor.net, [500.0, 0.0, 0.0])
     rows = flat(whole(algo, transition(algo, [[1, 2]]))) | {"advantage": torch.ones(1, N)}
     (slope,) = torch.autograd.grad(algo._actor_loss(rows)[0], [bias])
@@ -357,7 +357,7 @@ def test_actions_are_drawn_with_their_chances() -> None:
 def test_an_update_waits_for_the_rollout_and_shows_every_row_as_often_as_it_says(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    algo = method(rollout=5, epochs=3, minibatches=2, actor_minibatches=5)
+    algo = method(n_steps=5, epochs=3, minibatches=2, actor_minibatches=5)
     shown: dict[str, list[list[float]]] = {"_critic_loss": [], "_actor_loss": []}
 
     def spied(name: str) -> Callable[[Batch], Any]:

@@ -13,12 +13,13 @@ from torch import Generator, Tensor, nn
 from rhmc.algorithms.hitmac import PRACTISED, Config, Decisions, HiTMAC, practice
 from rhmc.envs import coverage, make_env
 from rhmc.envs.base import Env
-from rhmc.hierarchy.attention import Assigner, Contributions, likelihood, orders
+from rhmc.hierarchy.attention import Assigner, Contributions, Settings, likelihood, orders
 from rhmc.learning.learner import pack
 from rhmc.networks.nets import Sizes
 from rhmc.training.trainer import Config as Budget
 from rhmc.training.trainer import Trainer
 from rhmc.types import Batch, Local, Obs, Spec, Transition
+from tests.blocks import nested
 from tests.conformance import DifferentError, assert_same
 
 SPEC = Spec(2, 3, agent_features=0, pair_features=4, peer_features=0, actions=3, continuous=False, episode=7)
@@ -34,12 +35,15 @@ def _seed() -> None:
     torch.manual_seed(0)
 
 
+OWN = {name: f"coordinator.{name}" for name in Settings.model_fields}
+
+
 def config(**changes: Any) -> Config:
-    return Config(
-        **{"hidden": 8, "batch": 8, "buffer": 64, "warmup": 8, "steps_per_update": 4, "pretrain": 0}
-        | {"assignment_period": 3, "rollout": 2, "epochs": 1, "minibatches": 1, "gamma": 0.5, "standardise": "none"}
-        | changes
-    )
+    """Changes without a block are of the coordinator where it has such a field."""
+    settings = {"hidden_dim": 8, "executor.batch_size": 8, "buffer_size": 64, "learning_starts": 8, "train_freq": 4}
+    settings |= {"pretrain": 0, "assignment_period": 3}
+    own = {"n_steps": 2, "epochs": 1, "minibatches": 1, "gamma": 0.5, "standardise": "none"} | changes
+    return Config(**nested(settings | {OWN.get(name, name): value for name, value in own.items()}))
 
 
 def observation(batch: int, first: bool = False) -> Obs:
@@ -173,11 +177,13 @@ def test_assignments_are_drawn_with_the_chances_that_are_said() -> None:
 # Decisions
 
 
-def step(obs: Obs, extra: Batch, reward: float, after: Obs, *, terminal: bool = False, truncated: bool = False) -> Any:
+def step(
+    obs: Obs, extra: Batch, reward: float, after: Obs, *, terminated: bool = False, truncated: bool = False
+) -> Any:
     """A transition of all environments alike."""
     b = len(obs.pairs)
     local = Local(torch.zeros(b, N, M), torch.zeros(b, N))
-    flags = torch.full((b,), terminal), torch.full((b,), truncated)
+    flags = torch.full((b,), terminated), torch.full((b,), truncated)
     done, action = torch.zeros(b, N, M).bool(), torch.zeros(b, N, dtype=torch.int64)
 
     def options(horizon: int) -> Tensor:
@@ -212,29 +218,29 @@ def test_a_decision_is_paid_the_mean_of_its_steps_and_a_cut_one_for_those_it_had
     assert rows is not None
     assert rows["reward"].tolist() == [[pytest.approx(2.0)] * 2, [pytest.approx(3.0)] * 2]
     assert rows["length"].tolist() == [[3.0, 3.0], [2.0, 2.0]]
-    assert rows["ended"].tolist() == [[False, False], [True, True]]
-    assert not rows["terminal"].any()
+    assert rows["done"].tolist() == [[False, False], [True, True]]
+    assert not rows["terminated"].any()
     for key, (first, second) in {"": (seen[0], seen[3]), "next_": (seen[3], seen[5])}.items():
         assert torch.equal(rows[f"{key}pairs"], torch.stack((first.pairs, second.pairs)))
 
 
-@pytest.mark.parametrize("terminal", [False, True])
-def test_returns_of_decisions_by_hand(terminal: bool) -> None:
+@pytest.mark.parametrize("terminated", [False, True])
+def test_returns_of_decisions_by_hand(terminated: bool) -> None:
     """Lambda 1: the second decision had 2 of 3 steps, so what follows it is discounted by 0.5 ** (2 / 3)."""
     algo = HiTMAC(config(), SPEC, 1, seeded())
     flat_value(algo, 8.0)
-    play(algo, [1.0, 2.0, 3.0, 4.0, 5.0], terminal=terminal, truncated=not terminal)
+    play(algo, [1.0, 2.0, 3.0, 4.0, 5.0], terminated=terminated, truncated=not terminated)
     rows = algo.decisions.take()
     assert rows is not None
     data = algo.coordinator.judge(rows)
-    second = (4 + 5) / 3 + (0 if terminal else 0.5 ** (2 / 3) * 8)
+    second = (4 + 5) / 3 + (0 if terminated else 0.5 ** (2 / 3) * 8)
     first = (1 + 2 + 3) / 3 + 0.5 * second
     assert data["target"].tolist() == pytest.approx([first, second], abs=1e-4)
     assert data["advantage"].sign().tolist() == ([1, -1] if first > second else [-1, 1])
 
 
 def test_half_a_lambda_mixes_in_the_critics_word() -> None:
-    algo = HiTMAC(config(lam=0.5), SPEC, 1, seeded())
+    algo = HiTMAC(config(gae_lambda=0.5), SPEC, 1, seeded())
     flat_value(algo, 8.0)
     play(algo, [1.0] * 6, truncated=True)
     rows = algo.decisions.take()
@@ -250,7 +256,7 @@ def test_environments_that_are_out_of_step_keep_their_own_decisions() -> None:
     decisions = Decisions(2, torch.device("cpu"))
 
     def add(value: float, done: list[bool]) -> None:
-        rows = {"x": torch.tensor([value, 10 * value]), "ended": torch.zeros(2, dtype=torch.bool)}
+        rows = {"x": torch.tensor([value, 10 * value]), "done": torch.zeros(2, dtype=torch.bool)}
         decisions.add(rows, torch.tensor(done))
 
     add(1.0, [True, False])
@@ -261,15 +267,15 @@ def test_environments_that_are_out_of_step_keep_their_own_decisions() -> None:
     assert rows is not None
     assert rows["x"].tolist() == [[1.0, 20.0], [3.0, 0.0]]
     assert rows["filled"].tolist() == [[True, True], [True, False]]
-    assert rows["ended"].tolist() == [[False, True], [True, True]]
+    assert rows["done"].tolist() == [[False, True], [True, True]]
     assert decisions.take() is None
 
 
 def test_out_of_step_decisions_bootstrap_from_their_own_successors() -> None:
-    algo = HiTMAC(config(rollout=2), SPEC, 2, seeded())
+    algo = HiTMAC(config(n_steps=2), SPEC, 2, seeded())
     seen, after = observation(2), observation(2)
     common = {"assignment": torch.zeros(2, N, M), "chance": torch.zeros(2, N, M), "length": torch.full((2,), 3.0)}
-    flags = {"terminal": torch.zeros(2).bool(), "ended": torch.zeros(2).bool(), "reward": torch.zeros(2)}
+    flags = {"terminated": torch.zeros(2).bool(), "done": torch.zeros(2).bool(), "reward": torch.zeros(2)}
     rows = common | flags | pack(seen) | pack(after, "next_")
     for done in ([True, True], [True, False]):
         algo.decisions.add(rows, torch.tensor(done))
@@ -315,7 +321,7 @@ def decided(algo: HiTMAC, advantage: float) -> Batch:
 
 @pytest.mark.parametrize("advantage", [1.0, -1.0])
 def test_the_policy_goes_where_the_advantage_points_as_far_as_the_clip(advantage: float) -> None:
-    algo = HiTMAC(config(lr=1e-2, entropy=0.0), SPEC, 4, seeded())
+    algo = HiTMAC(config(lr=1e-2, ent_coef=0.0), SPEC, 4, seeded())
     rows, ratios = decided(algo, advantage), []
     for _ in range(80):
         logs = algo.coordinator.improve(rows)
@@ -420,7 +426,7 @@ def test_the_coordinator_takes_over_everywhere_at_once() -> None:
 
 
 def test_a_run_continues_from_any_step_of_both_phases_bit_for_bit() -> None:
-    again = {"epochs": 2, "minibatches": 2, "rollout": 3}
+    again = {"epochs": 2, "minibatches": 2, "n_steps": 3}
     run, states, items = trainer(**again), [], []
     for item in run:
         items.append(item)
@@ -438,7 +444,7 @@ def test_a_run_continues_from_any_step_of_both_phases_bit_for_bit() -> None:
 
 def test_one_pass_in_one_batch_is_the_plain_actor_critic() -> None:
     """The ratio is 1 then, and the gradient that of the advantage times the log-likelihood, per pair."""
-    algo = HiTMAC(config(entropy=0.0), SPEC, 4, seeded())
+    algo = HiTMAC(config(ent_coef=0.0), SPEC, 4, seeded())
     rows = decided(algo, 1.0) | {"advantage": torch.randn(32)}
     obs = Obs(rows["agents"], rows["pairs"], rows["peers"], torch.zeros(32).bool())
     chance = likelihood(algo.coordinator.actor.net(obs), rows["assignment"]).sum((1, 2))

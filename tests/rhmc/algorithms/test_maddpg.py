@@ -21,7 +21,7 @@ from tests.conformance import assert_same
 N, A = 3, 2
 SPEC = Spec(N, 2, agent_features=1, pair_features=4, peer_features=2, actions=A, continuous=False, episode=9)
 FORCE = navigation.Config(agents=3, continuous=True, episode=7)
-SMALL: dict[str, Any] = {"hidden": 8, "buffer": 40, "batch": 8, "warmup": 12, "steps_per_update": 4}
+SMALL: dict[str, Any] = {"hidden_dim": 8, "buffer_size": 40, "batch_size": 8, "learning_starts": 12, "train_freq": 4}
 RUN = Run(steps=44, num_envs=4, evaluations=5, eval_episodes=2, final_episodes=2)
 either = pytest.mark.parametrize("continuous", [False, True], ids=["discrete", "continuous"])
 both = pytest.mark.parametrize("encoder", ["mlp", "pairwise"])
@@ -47,9 +47,9 @@ def observation(batch: int) -> Obs:
     return Obs(torch.randn(batch, N, 1), pairs, peers, torch.zeros(batch, dtype=torch.bool))
 
 
-def rows(continuous: bool, batch: int = 5, terminal: bool = False) -> Batch:
+def rows(continuous: bool, batch: int = 5, terminated: bool = False) -> Batch:
     action = torch.rand(batch, N, A) * 2 - 1 if continuous else torch.randint(A, (batch, N))
-    out = {"action": action, "reward": torch.randn(batch), "terminal": torch.full((batch,), terminal)}
+    out = {"action": action, "reward": torch.randn(batch), "terminated": torch.full((batch,), terminated)}
     return out | pack(observation(batch)) | pack(observation(batch), "next_")
 
 
@@ -172,18 +172,18 @@ def test_a_critic_takes_the_own_action_and_the_others(encoder: str, continuous: 
 
 
 @either
-@pytest.mark.parametrize("terminal", [False, True])
-def test_target_by_hand(continuous: bool, terminal: bool) -> None:
+@pytest.mark.parametrize("terminated", [False, True])
+def test_target_by_hand(continuous: bool, terminated: bool) -> None:
     """The slow actor's best actions, valued by the slow critic, all agents' together, in the next observation."""
-    algo, batch = method(continuous, gamma=0.5), rows(continuous, terminal=terminal)
-    critic = algo.critic.slow = Critic()
-    algo.actor.slow = Actor(torch.tensor([[2.0, 1.0], [-1.0, 3.0], [0.5, -0.5]]))
+    algo, batch = method(continuous, gamma=0.5), rows(continuous, terminated=terminated)
+    critic = algo.critic.target_net = Critic()
+    algo.actor.target_net = Actor(torch.tensor([[2.0, 1.0], [-1.0, 3.0], [0.5, -0.5]]))
     algo.actor.net = algo.critic.net = nn.Identity()  # not asked
     best = torch.tensor([[2.0, 1.0], [-1.0, 3.0], [0.5, -0.5]]).tanh()
     if not continuous:
         best = torch.tensor([[1.0, 0.0], [0.0, 1.0], [1.0, 0.0]])
     value = torch.tensor([0.0, 100.0, 200.0]) + (critic.slope * best).sum(-1) + 10 * best[:, 0].sum()
-    expected = batch["reward"].unsqueeze(-1) + (0 if terminal else 0.5 * value)
+    expected = batch["reward"].unsqueeze(-1) + (0 if terminated else 0.5 * value)
     target = algo._target(batch)
     assert target.shape == (5, N)
     assert torch.allclose(target, expected.expand(5, N))
@@ -196,7 +196,7 @@ def test_target_by_hand(continuous: bool, terminal: bool) -> None:
 @either
 def test_critic_loss_by_hand(continuous: bool) -> None:
     """The taken actions, each agent's own and all of them, in the observation that they were taken in."""
-    algo, batch = method(continuous), rows(continuous, terminal=True)
+    algo, batch = method(continuous), rows(continuous, terminated=True)
     critic = algo.critic.net = Critic()
     loss, _ = algo._critic_loss(batch)
     ((obs, own, joint),) = critic.given
@@ -212,16 +212,16 @@ def test_critic_loss_by_hand(continuous: bool) -> None:
 def test_standardised_targets_by_hand(mode: str) -> None:
     """With mean -4 and deviation 2: of the reward, or of what the networks put out."""
     algo, batch = method(gamma=0.5, standardise=mode), rows(False)
-    algo.standard.sums = torch.tensor([1.0, -4.0, 20.0])
-    algo.critic.slow, algo.actor.slow = Critic(), Actor(torch.zeros(N, A))
-    value = torch.tensor([0.0, 100.0, 200.0]) + algo.critic.slow.slope[:, 0] + 30
+    algo.standardiser.sums = torch.tensor([1.0, -4.0, 20.0])
+    algo.critic.target_net, algo.actor.target_net = Critic(), Actor(torch.zeros(N, A))
+    value = torch.tensor([0.0, 100.0, 200.0]) + algo.critic.target_net.slope[:, 0] + 30
     reward = batch["reward"].unsqueeze(-1)
     expected = (reward + 4) / 2 + 0.5 * value if mode == "reward" else reward + 0.5 * (2 * value - 4)
     assert torch.allclose(algo._target(batch), expected, rtol=1e-5)
 
 
 def test_what_the_critic_learns_is_standardised_after_it_was_counted_in() -> None:
-    algo, batch = method(standardise="return"), rows(False, batch=400, terminal=True)
+    algo, batch = method(standardise="return"), rows(False, batch=400, terminated=True)
     critic = algo.critic.net = Critic()
     loss, _ = algo._critic_loss(batch)
     obs, own, joint = critic.given[0]
@@ -272,15 +272,15 @@ def test_no_others_action_reaches_an_agents_value_with_a_gradient(encoder: str, 
 @both
 @either
 def test_an_update_moves_both_networks_each_by_its_own_loss(encoder: str, continuous: bool) -> None:
-    algo = method(continuous, encoder=encoder, warmup=0, steps_per_update=1, polyak=0.9)
+    algo = method(continuous, encoder=encoder, learning_starts=0, train_freq=1, tau=0.1)
     algo.experience.add(rows(continuous), 1)
     before = [p.detach().clone() for p in (*algo.actor.params, *algo.critic.params)]
-    slow = [p.clone() for p in (*algo.actor.slow_params, *algo.critic.slow_params)]
+    slow = [p.clone() for p in (*algo.actor.target_params, *algo.critic.target_params)]
     logs = algo.update()
     assert {"td_loss", "q", "output", "grad_norm", "actor_grad_norm"} <= set(logs)
     for old, new in zip(before, (*algo.actor.params, *algo.critic.params), strict=True):
         assert not torch.equal(old, new)
-    after = (*algo.actor.slow_params, *algo.critic.slow_params)
+    after = (*algo.actor.target_params, *algo.critic.target_params)
     for old, copy, new in zip(slow, after, (*algo.actor.params, *algo.critic.params), strict=True):
         assert torch.allclose(copy, 0.9 * old + 0.1 * new, atol=1e-6)
 

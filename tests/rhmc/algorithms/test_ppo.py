@@ -30,7 +30,7 @@ def seeded(seed: int = 0) -> Generator:
 
 
 def config(**changes: Any) -> Config:
-    return Config(**{"hidden": 16, "rollout": 2, "epochs": 1, "minibatches": 1} | changes)
+    return Config(**{"hidden_dim": 16, "n_steps": 2, "epochs": 1, "minibatches": 1} | changes)
 
 
 def method(sees: Literal["local", "central"] = "central", **changes: Any) -> PPO:
@@ -87,7 +87,7 @@ def policies(*chances: list[float]) -> Tensor:
 )
 def test_the_clipped_objective_by_hand(new: float, advantage: float, loss: float, moves: bool) -> None:
     now, old = policies([1 - new, new]), policies([0.5, 0.5]).detach()
-    found = Clip(config(clip=0.2), CPU)(now, old, torch.tensor([[1]]), torch.tensor([[advantage]]))
+    found = Clip(config(clip_range=0.2), CPU)(now, old, torch.tensor([[1]]), torch.tensor([[advantage]]))
     assert found.shape == (1, 1)
     assert found.item() == pytest.approx(loss)
     (grad,) = torch.autograd.grad(found.sum(), now)
@@ -98,7 +98,7 @@ def test_the_clipped_objective_by_hand(new: float, advantage: float, loss: float
 @pytest.mark.parametrize(("clip", "loss"), [(0.1, -1.1), (0.3, -1.3), (0.6, -1.5)])
 def test_the_clip_is_where_it_is_set(clip: float, loss: float) -> None:
     now, old = policies([0.25, 0.75]), policies([0.5, 0.5])
-    found = Clip(config(clip=clip), CPU)(now, old, torch.tensor([[1]]), torch.ones(1, 1))
+    found = Clip(config(clip_range=clip), CPU)(now, old, torch.tensor([[1]]), torch.ones(1, 1))
     assert found.item() == pytest.approx(loss)
 
 
@@ -131,7 +131,7 @@ def test_the_price_follows_the_divergence(divergence: float, factor: float) -> N
 
 @pytest.mark.parametrize(("target", "factor"), [(1e-9, 2.0), (1e3, 0.5)])
 def test_the_price_is_set_after_every_rollout_and_kept_in_a_checkpoint(target: float, factor: float) -> None:
-    algo = method(objective="kl_adaptive", kl_target=target, rollout=1, epochs=3)
+    algo = method(objective="kl_adaptive", kl_target=target, n_steps=1, epochs=3)
     for _ in range(2):
         algo.observe(acted(algo, torch.rand(5)))
         algo.update()
@@ -142,7 +142,7 @@ def test_the_price_is_set_after_every_rollout_and_kept_in_a_checkpoint(target: f
 
 
 def test_the_divergence_told_is_that_of_the_whole_rollouts_updates() -> None:
-    algo = method(rollout=1, epochs=4, minibatches=3, lr=0.05)
+    algo = method(n_steps=1, epochs=4, minibatches=3, lr=0.05)
     obs = observation(10)
     with torch.no_grad():
         before = algo._policy(obs)
@@ -172,7 +172,7 @@ def test_actions_are_drawn_from_the_policy_that_is_handed_out() -> None:
 
 
 def test_nothing_is_learned_before_a_rollout_is_full() -> None:
-    algo = method(rollout=3)
+    algo = method(n_steps=3)
     done = []
     for _ in range(7):
         algo.observe(acted(algo, torch.rand(4)))
@@ -210,10 +210,10 @@ def test_targets_and_advantages_by_hand(
     monkeypatch: pytest.MonkeyPatch, sees: Any, standardise: str, target: list[float]
 ) -> None:
     """Value 2, rewards 1 and then 3, which is the last: errors 0 and 1, advantages 0.25 and 1, to every agent."""
-    algo = method(sees, gamma=0.5, lam=0.5, standardise=standardise)
+    algo = method(sees, gamma=0.5, gae_lambda=0.5, standardise=standardise)
     constant(algo.critic.net, [2.0])
     algo.observe(acted(algo, torch.tensor([1.0])))
-    algo.observe(acted(algo, torch.tensor([3.0]), terminal=torch.tensor([True])))
+    algo.observe(acted(algo, torch.tensor([3.0]), terminated=torch.tensor([True])))
     advantage, value, found = judged(monkeypatch, algo)
     assert torch.equal(value, torch.full((2, N), 2.0))
     assert torch.allclose(found, torch.tensor(target).unsqueeze(1).expand(2, N), atol=1e-4)
@@ -222,7 +222,7 @@ def test_targets_and_advantages_by_hand(
 
 def test_rewards_are_standardised_before_the_returns(monkeypatch: pytest.MonkeyPatch) -> None:
     """Mean 2 and deviation 1; value 0.5 everywhere, gamma 0.5."""
-    algo = method(gamma=0.5, standardise="reward", rollout=1)
+    algo = method(gamma=0.5, standardise="reward", n_steps=1)
     constant(algo.critic.net, [0.5])
     algo.observe(acted(algo, torch.tensor([1.0, 3.0])))
     _, _, target = judged(monkeypatch, algo)
@@ -231,12 +231,12 @@ def test_rewards_are_standardised_before_the_returns(monkeypatch: pytest.MonkeyP
 
 def test_values_are_taken_back_to_the_scale_of_returns(monkeypatch: pytest.MonkeyPatch) -> None:
     """The critic says 1, which is 10 + 4 x 1; reward 7: 7 + 0.5 x 14 is what is to be learned."""
-    algo = method(gamma=0.5, rollout=1)
-    algo.standard.sums = torch.tensor([1.0, 10.0, 116.0])
+    algo = method(gamma=0.5, n_steps=1)
+    algo.standardiser.sums = torch.tensor([1.0, 10.0, 116.0])
     constant(algo.critic.net, [1.0])
     algo.observe(acted(algo, torch.tensor([7.0])))
     _, _, target = judged(monkeypatch, algo)
-    assert torch.allclose(algo.standard.value(target), torch.full((1, N), 14.0), atol=1e-3)
+    assert torch.allclose(algo.standardiser.value(target), torch.full((1, N), 14.0), atol=1e-3)
 
 
 @given(st.lists(st.integers(-100, 100), min_size=2, max_size=30))
@@ -252,9 +252,9 @@ def test_advantages_have_mean_0_and_deviation_1(values: list[int]) -> None:
 
 def test_a_value_far_off_is_learned_from_linearly() -> None:
     """Error 3, linear from 1 on: 1 x (3 - 0.5)."""
-    algo = method(rollout=1, standardise="none", huber=1.0)
+    algo = method(n_steps=1, standardise="none", huber=1.0)
     constant(algo.critic.net, [0.0])
-    algo.observe(acted(algo, torch.tensor([3.0]), terminal=torch.tensor([True])))
+    algo.observe(acted(algo, torch.tensor([3.0]), terminated=torch.tensor([True])))
     assert algo.update()["value_loss"].item() == pytest.approx(2.5)
 
 
@@ -298,11 +298,11 @@ def test_the_first_update_starts_from_the_policy_that_acted(objective: str) -> N
 @pytest.mark.parametrize("entropy", [0.0, 0.1])
 def test_entropy_alone_makes_a_policy_uniform(entropy: float) -> None:
     """Where no action is better than another, and only then with a weight."""
-    algo = method(entropy=entropy, rollout=1, epochs=20, lr=0.01)
+    algo = method(ent_coef=entropy, n_steps=1, epochs=20, lr=0.01)
     constant(algo.actor.net, [1.0, 0.0, 0.0])
     constant(algo.critic.net, [0.0])
     before = algo._policy(observation()).exp().max()
-    algo.observe(acted(algo, torch.ones(4), terminal=torch.ones(4, dtype=torch.bool)))
+    algo.observe(acted(algo, torch.ones(4), terminated=torch.ones(4, dtype=torch.bool)))
     algo.update()
     after = algo._policy(observation()).exp().max()
     assert after < before - 0.05 if entropy else torch.equal(after, before)
@@ -328,13 +328,13 @@ def test_the_critic_of_mappo_sees_the_others_and_that_of_ippo_does_not() -> None
 @pytest.mark.parametrize("objective", ["clip", "kl_adaptive"])
 def test_a_bandit_is_learned(objective: str) -> None:
     """The team is paid for each agent whose action is 1 where its feature is positive, and 2 elsewhere."""
-    algo = method(objective=objective, rollout=4, epochs=5, minibatches=2, lr=5e-3, kl_target=0.05)
+    algo = method(objective=objective, n_steps=4, epochs=5, minibatches=2, lr=5e-3, kl_target=0.05)
     yes = torch.ones(32, dtype=torch.bool)
     for k in range(4 * 40):
         obs = observation(32)
         action, _, extra = algo.act(obs, {}, seeded(k), explore=True)
         reward = (action == torch.where(obs.agents.squeeze(-1) > 0, 1, 2)).float().mean(-1)
-        algo.observe(acted(algo, reward, obs, action=action, extra=extra, terminal=yes))
+        algo.observe(acted(algo, reward, obs, action=action, extra=extra, terminated=yes))
         algo.update()
     obs = observation(500)
     best = torch.where(obs.agents.squeeze(-1) > 0, 1, 2)

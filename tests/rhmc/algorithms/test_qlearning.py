@@ -37,10 +37,10 @@ def observation(batch: int, agents: int = 2, targets: int = 3) -> Obs:
     return Obs(own, pairs, torch.randn(batch, agents, agents, 2), torch.zeros(batch, dtype=torch.bool))
 
 
-def rows(reward: list[float], terminal: list[bool], action: list[list[int]]) -> Batch:
+def rows(reward: list[float], terminated: list[bool], action: list[list[int]]) -> Batch:
     """A batch to learn from."""
     count = len(reward)
-    known = {"reward": torch.tensor(reward), "terminal": torch.tensor(terminal), "action": torch.tensor(action)}
+    known = {"reward": torch.tensor(reward), "terminated": torch.tensor(terminated), "action": torch.tensor(action)}
     return known | pack(observation(count)) | pack(observation(count), "next_")
 
 
@@ -51,11 +51,11 @@ SLOW = [[50.0, 40.0, 30.0], [7.0, 8.0, 9.0]]  # would choose 0 and 2
 def learner(kind: str, **changes: Any) -> QLearning:
     """A method with known values in place of its networks; QMIX's mixer makes 2 a + b + 1 of values a and b."""
     method = ALGORITHMS[kind]
-    settings = {"gamma": 0.5, "standardise": "none", "lr": 1e-9, "embed": 1, "hidden": 4} | changes
+    settings = {"gamma": 0.5, "standardise": "none", "lr": 1e-9, "mixing_embed_dim": 1, "hidden_dim": 4} | changes
     cfg = method.config(**{key: value for key, value in settings.items() if key in method.config.model_fields})
     built = method.build(cfg, SPEC, 1, seeded())
     assert isinstance(built, QLearning)
-    for net, values in ((built.q.net, NET), (built.q.slow, SLOW)):
+    for net, values in ((built.q.net, NET), (built.q.target_net, SLOW)):
         net.agents = Known(values)
         if kind == "qmix":
             net.mixer = Doubling()
@@ -87,28 +87,28 @@ def test_targets_by_hand(kind: str, double: bool) -> None:
     for reward, live, now in ((0.25, 1, mixed(kind, 1, 3)), (-4, 0, mixed(kind, 2, 0.5))):
         expected += [(q - (reward + 0.5 * live * v)) ** 2 for q, v in zip(now, later, strict=True)]
     data = rows([0.25, -4.0], [False, True], [[1, 0], [2, 1]])
-    assert loss(learner(kind, double=double), data) == pytest.approx(sum(expected) / len(expected), rel=1e-5)
+    assert loss(learner(kind, double_q=double), data) == pytest.approx(sum(expected) / len(expected), rel=1e-5)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_standardised_rewards_by_hand(kind: str) -> None:
     """Mean 2 and deviation 1 of the two rewards met: the learner is paid (reward - 2) / 1."""
     q = learner(kind, standardise="reward")
-    q.standard.see_rewards(torch.tensor([1.0, 3.0]))
+    q.standardiser.update_rewards(torch.tensor([1.0, 3.0]))
     pay, now = (4.0 - 2) / 1, mixed(kind, 1, 3)
     expected = [(a - (pay + 0.5 * b)) ** 2 for a, b in zip(now, mixed(kind, 30, 7), strict=True)]
     data = rows([4.0], [False], [[1, 0]])
     assert loss(q, data) == pytest.approx(sum(expected) / len(expected), rel=1e-4)
-    before = q.standard.sums.clone()
+    before = q.standardiser.sums.clone()
     loss(q, data)
-    assert torch.equal(q.standard.sums, before)  # rewards are counted once, as they are met
+    assert torch.equal(q.standardiser.sums, before)  # rewards are counted once, as they are met
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_standardised_returns_by_hand(kind: str) -> None:
     """The slow copy's output means a return by the statistics so far; a target counts in them before it is one."""
     q = learner(kind, standardise="return")
-    q.standard.see_returns(torch.tensor([4.0, 8.0]))  # mean 6, deviation 2
+    q.standardiser.update_returns(torch.tensor([4.0, 8.0]))  # mean 6, deviation 2
     target = [0.25 + 0.5 * (v * 2 + 6) for v in mixed(kind, 30, 7)]
     old, new = 1 - KEPT, 1 - KEPT  # weights of the first batch after the second, and of the second
     shares = (old * KEPT / (old * KEPT + new), new / (old * KEPT + new))

@@ -419,7 +419,7 @@ def test_episodes_have_their_length_and_start_anew(preset: Any, length: int) -> 
         ends = t % length == 0
         assert step.truncated.tolist() == step.obs.first.tolist() == [ends, ends]
         assert not step.final_obs.first.any()
-        assert not step.terminal.any()
+        assert not step.terminated.any()
 
 
 def test_a_reset_keeps_the_true_last_observation_and_leaves_other_rows_alone() -> None:

@@ -262,7 +262,7 @@ def test_sizes_are_as_specified(n: int, continuous: bool, observation: Any) -> N
         assert {o.agents.dtype, o.pairs.dtype, o.peers.dtype} == {torch.float32}
         assert all(part.isfinite().all() for part in o[:3])
     assert (spec.targets, spec.actions, spec.continuous) == (n, 2 if continuous else 5, continuous)
-    assert step.reward.shape == step.terminal.shape == step.truncated.shape == (batch,)
+    assert step.reward.shape == step.terminated.shape == step.truncated.shape == (batch,)
     assert step.completed.shape == step.local.pairs.shape == (batch, n, n)
     assert env.options()(3).shape == (batch, n, n + 1, n)
     assert {k: v.shape for k, v in step.info.items()} == dict.fromkeys(
@@ -284,7 +284,7 @@ def test_episodes_have_their_length_and_keep_their_last_observation(episode: int
         ages = ages + 1
         done = ages == episode
         assert torch.equal(step.truncated, done)
-        assert not step.terminal.any()
+        assert not step.terminated.any()
         true_last = navigation.observe(cfg, navigation.transition(cfg, before, action, env.rng))
         assert all(torch.equal(a, b) for a, b in zip(step.final_obs[:3], true_last[:3], strict=True))
         assert not step.final_obs.first.any()

@@ -11,13 +11,14 @@ from torch import Generator, Tensor, nn
 from rhmc.algorithms.rhmc import RHMC, Config
 from rhmc.envs import coverage, make_env, navigation
 from rhmc.envs.base import Env
-from rhmc.hierarchy.coordinator import Coordinator, differences, worth
+from rhmc.hierarchy.coordinator import Coordinator, assignment_value, differences
 from rhmc.hierarchy.executor import Executor
 from rhmc.hierarchy.regulation import REGULATORS
 from rhmc.learning.learner import Learner, pack
 from rhmc.learning.normalisation import KEPT
 from rhmc.networks.nets import ENCODERS, PairNet, Sizes, append
 from rhmc.types import Batch, Obs, Spec, Transition, assigned_reward
+from tests.blocks import nested
 from tests.oracles import regulation as oracle
 
 SPEC = Spec(2, 3, agent_features=1, pair_features=4, peer_features=0, actions=3, continuous=False, episode=9)
@@ -34,7 +35,8 @@ def _seed() -> None:
 
 
 def config(**changes: Any) -> Config:
-    return Config(**{"hidden": 16, "batch": 8, "batch_h": 8, "gamma_l": 0.5, "gamma_h": 0.25} | changes)
+    few = {"hidden_dim": 16, "executor.batch_size": 8, "coordinator.batch_size": 8}
+    return Config(**nested(few | {"executor.gamma": 0.5, "coordinator.gamma": 0.25} | changes))
 
 
 def observation(batch: int) -> Obs:
@@ -42,11 +44,11 @@ def observation(batch: int) -> Obs:
     return Obs(agents, pairs, torch.zeros(batch, N, N, 0), torch.zeros(batch, dtype=torch.bool))
 
 
-def rows(batch: int = 1, terminal: bool = False, **changes: Tensor) -> Batch:
+def rows(batch: int = 1, terminated: bool = False, **changes: Tensor) -> Batch:
     """What both levels may be given; rewards are added by the test."""
     held = (torch.rand(batch, N, M) < 0.5).float()
     some = pack(observation(batch)) | pack(observation(batch), "next_")
-    return some | {"assignment": held, "terminal": torch.full((batch,), terminal)} | changes
+    return some | {"assignment": held, "terminated": torch.full((batch,), terminated)} | changes
 
 
 def constant(net: nn.Module, out: list[float]) -> None:
@@ -72,16 +74,16 @@ def outputs(net: nn.Module, call: Any) -> list[Tensor]:
 
 
 @pytest.mark.parametrize("encoder", ["mlp", "pairwise"])
-@pytest.mark.parametrize("terminal", [False, True])
-def test_executor_target_by_hand(encoder: str, terminal: bool) -> None:
+@pytest.mark.parametrize("terminated", [False, True])
+def test_executor_target_by_hand(encoder: str, terminated: bool) -> None:
     """The slow actor chooses action 1, the slow critic values it at 20."""
     low = Executor(config(encoder=encoder), SPEC, seeded())
     constant(low.critic.net, [1.0, 2.0, 4.0])
-    constant(low.critic.slow, [10.0, 20.0, 40.0])
-    constant(low.actor.slow, [0.0, 3.0, 1.0])
+    constant(low.critic.target_net, [10.0, 20.0, 40.0])
+    constant(low.actor.target_net, [0.0, 3.0, 1.0])
     constant(low.actor.net, [9.0, 0.0, 0.0])
-    logs = low.update(rows(terminal=terminal, reward=torch.tensor([[0.5, -1.0]]), action=torch.tensor([[2, 0]])))
-    later = 0.0 if terminal else 0.5 * 20
+    logs = low.update(rows(terminated=terminated, reward=torch.tensor([[0.5, -1.0]]), action=torch.tensor([[2, 0]])))
+    later = 0.0 if terminated else 0.5 * 20
     wrong = 4 - (0.5 + later), 1 - (-1.0 + later)
     assert logs["low_td"].item() == pytest.approx((wrong[0] ** 2 + wrong[1] ** 2) / 2)
 
@@ -89,7 +91,9 @@ def test_executor_target_by_hand(encoder: str, terminal: bool) -> None:
 @pytest.mark.parametrize("gradient", ["gumbel", "expected"])
 @pytest.mark.parametrize("encoder", ["mlp", "pairwise"])
 def test_executor_goes_up_a_critic_that_prefers_one_action(gradient: str, encoder: str) -> None:
-    low = Executor(config(encoder=encoder, executor=gradient, lr=0.01, logit_penalty=0.0), SPEC, seeded())
+    low = Executor(
+        config(encoder=encoder, executor__method=gradient, lr=0.01, executor__logit_penalty=0.0), SPEC, seeded()
+    )
     constant(low.critic.net, [0.0, 0.0, 3.0])
     low.critic = Learner(low.critic.net, lr=0.0)
     data = rows(64, reward=torch.zeros(64, N), action=torch.zeros(64, N, dtype=torch.int64))
@@ -106,7 +110,7 @@ def test_executor_goes_up_a_critic_that_prefers_one_action(gradient: str, encode
 
 
 def test_executor_explores_by_a_share_of_random_actions() -> None:
-    low = Executor(config(epsilon=0.3), SPEC, seeded())
+    low = Executor(config(executor__epsilon=0.3), SPEC, seeded())
     constant(low.actor.net, [20.0, 0.0, 0.0])
     drawn = low.act(observation(10_000), torch.zeros(10_000, N, M), seeded(), explore=True)
     share = drawn.flatten().bincount(minlength=3) / drawn.numel()
@@ -119,7 +123,7 @@ def test_executor_rows_hold_the_reward_under_the_assignment() -> None:
     obs, options = env.reset(), env.options()
     action, held = torch.ones(5, N, dtype=torch.int64), (torch.rand(5, N, M) < 0.4).float()
     s = env.step(action, held)
-    t = Transition(obs, action, s.reward, s.local, s.completed, s.terminal, s.truncated, s.final_obs, options, {})
+    t = Transition(obs, action, s.reward, s.local, s.completed, s.terminated, s.truncated, s.final_obs, options, {})
     kept = low.rows(t, held)
     assert torch.equal(kept["assignment"], held)
     for b, i in product(range(5), range(N)):
@@ -134,7 +138,7 @@ def test_executor_rows_hold_the_reward_under_the_assignment() -> None:
 @pytest.mark.parametrize("mode", ["on", "off"])
 def test_what_an_executor_sees_of_unassigned_targets(encoder: str, mode: str) -> None:
     """With the filter, nothing: neither acting nor in any pass of its actor while learning."""
-    low = Executor(config(encoder=encoder, filter=mode, polyak=1.0, lr=1e-9), SPEC, seeded())
+    low = Executor(config(encoder=encoder, filter=mode, tau=0.0, lr=1e-9), SPEC, seeded())
     data = rows(40, reward=torch.zeros(40, N), action=torch.zeros(40, N, dtype=torch.int64))
     held = data["assignment"]
     hidden = held.unsqueeze(-1) == 0
@@ -146,11 +150,11 @@ def test_what_an_executor_sees_of_unassigned_targets(encoder: str, mode: str) ->
         acting = outputs(low.actor.net, lambda: low.act(obs, held, seeded(), explore=True))
         with torch.no_grad():
             kept = [p.clone() for p in low.actor.params]
-        learning = outputs(low.actor.net, lambda: outputs(low.actor.slow, lambda: low.update(data)))
+        learning = outputs(low.actor.net, lambda: outputs(low.actor.target_net, lambda: low.update(data)))
         with torch.no_grad():
             for p, value in zip(low.actor.params, kept, strict=True):
                 p.copy_(value)
-        return acting + learning + outputs(low.actor.slow, lambda: low.update(data))
+        return acting + learning + outputs(low.actor.target_net, lambda: low.update(data))
 
     base, changed, visible = scores(data), scores(other), scores(shown)
     assert len(base) >= 3
@@ -177,8 +181,8 @@ def test_the_slow_copies_and_the_other_network_of_a_level_are_left_alone(encoder
     for name, level in (("low", low), ("high", high)):
         for still in ("actor", "critic"):
             moving = {"actor": "critic", "critic": "actor"}[still]
-            setattr(level, still, Learner(getattr(level, still).net, lr=0.0, polyak=1.0))
-            setattr(level, moving, Learner(getattr(level, moving).net, lr=0.01, polyak=1.0))
+            setattr(level, still, Learner(getattr(level, still).net, lr=0.0, tau=0.0))
+            setattr(level, moving, Learner(getattr(level, moving).net, lr=0.01, tau=0.0))
             before = {key: _values(getattr(level, key)) for key in ("actor", "critic")}
             level.update(data | {"reward": rewards[name], "earned": torch.ones(8)})
             after = {key: _values(getattr(level, key)) for key in ("actor", "critic")}
@@ -189,7 +193,7 @@ def test_the_slow_copies_and_the_other_network_of_a_level_are_left_alone(encoder
 
 
 def _values(learner: Learner) -> list[Tensor]:
-    return [p.detach().clone() for net in (learner.net, learner.slow) for p in net.parameters()]
+    return [p.detach().clone() for net in (learner.net, learner.target_net) for p in net.parameters()]
 
 
 # Coordinator
@@ -197,26 +201,26 @@ def _values(learner: Learner) -> list[Tensor]:
 
 @pytest.mark.parametrize("gradient", ["ddpg", "counterfactual"])
 @pytest.mark.parametrize("encoder", ["mlp", "pairwise"])
-@pytest.mark.parametrize("terminal", [False, True])
-def test_coordinator_target_by_hand(gradient: str, encoder: str, terminal: bool) -> None:
+@pytest.mark.parametrize("terminated", [False, True])
+def test_coordinator_target_by_hand(gradient: str, encoder: str, terminated: bool) -> None:
     """The critic is a sum over the six pairs: 6 x 0.5 now, 6 x 2 later."""
-    high = Coordinator(config(encoder=encoder, coordinator=gradient), SPEC, seeded())
+    high = Coordinator(config(encoder=encoder, coordinator__gradient=gradient), SPEC, seeded())
     constant(high.critic.net, [0.5])
-    constant(high.critic.slow, [2.0])
-    logs = high.update(rows(terminal=terminal, reward=torch.tensor([0.75]), earned=torch.tensor([0.0])))
-    target = 0.75 if terminal else 0.75 + 0.25 * N * M * 2
+    constant(high.critic.target_net, [2.0])
+    logs = high.update(rows(terminated=terminated, reward=torch.tensor([0.75]), earned=torch.tensor([0.0])))
+    target = 0.75 if terminated else 0.75 + 0.25 * N * M * 2
     assert logs["high_td"].item() == pytest.approx((N * M * 0.5 - target) ** 2)
 
 
 def test_coordinator_standardises_rewards_or_returns_by_those_seen() -> None:
     """Rewards of mean 2 and deviation 1; returns of mean 6 and deviation 2, the next one put out as 12 of them."""
     for scale, target in (("reward", (0.75 - 2) + 0.25 * 12), ("return", (0.75 + 0.25 * (12 * 2 + 6) - 6) / 2)):
-        high = Coordinator(config(encoder="mlp", standardise_h=scale), SPEC, seeded())
+        high = Coordinator(config(encoder="mlp", coordinator__standardise=scale), SPEC, seeded())
         constant(high.critic.net, [0.5])
-        constant(high.critic.slow, [2.0])
-        high.standard.see_rewards(torch.tensor([1.0, 3.0]))
-        high.standard.see_returns(torch.tensor([4.0, 8.0]))
-        high.standard.see_returns = lambda value: None  # type: ignore[method-assign]
+        constant(high.critic.target_net, [2.0])
+        high.standardiser.update_rewards(torch.tensor([1.0, 3.0]))
+        high.standardiser.update_returns(torch.tensor([4.0, 8.0]))
+        high.standardiser.update_returns = lambda value: None  # type: ignore[method-assign]
         logs = high.update(rows(reward=torch.tensor([0.75]), earned=torch.tensor([0.0])))
         assert logs["high_td"].item() == pytest.approx((N * M * 0.5 - target) ** 2, rel=1e-4), scale
 
@@ -224,13 +228,13 @@ def test_coordinator_standardises_rewards_or_returns_by_those_seen() -> None:
 def test_executor_standardises_rewards_or_returns_by_those_seen() -> None:
     """As above; the slow critic puts out 20 for the action that the slow actor chooses."""
     for scale, target in (("reward", (0.5 - 2) + 0.5 * 20), ("return", (0.5 + 0.5 * (20 * 2 + 6) - 6) / 2)):
-        low = Executor(config(encoder="mlp", standardise_l=scale), SPEC, seeded())
+        low = Executor(config(encoder="mlp", executor__standardise=scale), SPEC, seeded())
         constant(low.critic.net, [1.0, 2.0, 4.0])
-        constant(low.critic.slow, [10.0, 20.0, 40.0])
-        constant(low.actor.slow, [0.0, 3.0, 1.0])
-        low.standard.see_rewards(torch.tensor([1.0, 3.0]))
-        low.standard.see_returns(torch.tensor([4.0, 8.0]))
-        low.standard.see_returns = lambda value: None  # type: ignore[method-assign]
+        constant(low.critic.target_net, [10.0, 20.0, 40.0])
+        constant(low.actor.target_net, [0.0, 3.0, 1.0])
+        low.standardiser.update_rewards(torch.tensor([1.0, 3.0]))
+        low.standardiser.update_returns(torch.tensor([4.0, 8.0]))
+        low.standardiser.update_returns = lambda value: None  # type: ignore[method-assign]
         pay, action = torch.full((1, N), 0.5), torch.full((1, N), 2)
         assert low.update(rows(reward=pay, action=action))["low_td"].item() == pytest.approx(
             (4 - target) ** 2, rel=1e-4
@@ -239,7 +243,13 @@ def test_executor_standardises_rewards_or_returns_by_those_seen() -> None:
 
 def test_each_level_counts_its_own_rewards() -> None:
     """The coordinator what it is paid for ended periods, the executors theirs at every step."""
-    cfg = config(standardise_l="reward", standardise_h="reward", assignment_period=2, regulator="none", warmup=10**6)
+    cfg = config(
+        executor__standardise="reward",
+        coordinator__standardise="reward",
+        assignment_period=2,
+        regulator="none",
+        learning_starts=10**6,
+    )
     env = make_env(coverage.Config(agents=N, targets=M), 5, seeded(1))
     algo = RHMC(cfg, env.spec, 5, seeded())
     obs, carry = env.reset(), algo.carry(5)
@@ -247,13 +257,13 @@ def test_each_level_counts_its_own_rewards() -> None:
         action, carry, extra = algo.act(obs, carry, seeded(2), explore=True)
         options, s = env.options(), env.step(action, extra["assignment"])
         t = Transition(
-            obs, action, s.reward, s.local, s.completed, s.terminal, s.truncated, s.final_obs, options, extra
+            obs, action, s.reward, s.local, s.completed, s.terminated, s.truncated, s.final_obs, options, extra
         )
         algo.observe(t)
         obs = s.obs
     assert algo.high.size == 2 * 5
     for name, level, kept in (("low", algo.executor, algo.low.replay), ("high", algo.coordinator, algo.high)):
-        weight, total, _ = level.standard.sums
+        weight, total, _ = level.standardiser.sums
         found = kept.rows["reward"][: kept.size].mean().item()
         assert (total / weight).item() == pytest.approx(found, abs=2e-3), name
         assert weight.item() == pytest.approx(1 - KEPT ** (4 if name == "low" else 2), rel=1e-3)
@@ -289,8 +299,8 @@ WEIGHT = torch.tensor([[1.0, -1.0, 0.5], [-2.0, 0.8, -0.5]])
 
 
 def taught(critic: Taught, gradient: str, updates: int) -> tuple[Tensor, Tensor]:
-    """Logits (N, M) in one state, before and after following a known critic."""
-    high = Coordinator(config(coordinator=gradient, lr=3e-3, entropy=0.0), SPEC, seeded())
+    """Logits (N, M) in one state, before and after next_values a known critic."""
+    high = Coordinator(config(coordinator__gradient=gradient, lr=3e-3, coordinator__ent_coef=0.0), SPEC, seeded())
     high.critic = Learner(critic, lr=0.0)
     data = rows(1, reward=torch.zeros(1), earned=torch.zeros(1))
     data = {key: value.repeat_interleave(64, 0) for key, value in data.items()}
@@ -333,7 +343,7 @@ def test_differences_are_those_of_assigning_and_not_assigning_each_pair(
             for value in (1, 0):
                 one = held.clone()
                 one[:, i, j] = value
-                both.append(worth(critic, obs, one))
+                both.append(assignment_value(critic, obs, one))
             assert torch.allclose(found[:, i, j], both[0] - both[1], atol=1e-5)
     assert found.abs().max() > 1e-3
 
@@ -348,12 +358,12 @@ def test_flips_are_the_critics_values_with_one_pair_changed(encoder: str) -> Non
 
 def test_worth_of_a_known_critic() -> None:
     obs, held = observation(2), torch.stack((torch.ones(N, M), torch.zeros(N, M)))
-    value = worth(Taught(WEIGHT.clone(), crowd=2.0), obs, held)
+    value = assignment_value(Taught(WEIGHT.clone(), crowd=2.0), obs, held)
     assert value.tolist() == pytest.approx([WEIGHT.sum().item() - 2 * 25, -2])
 
 
 def test_coordinator_assigns_by_its_logits_and_flips_a_share() -> None:
-    high = Coordinator(config(flip=0.2), SPEC, seeded())
+    high = Coordinator(config(coordinator__assignment_epsilon=0.2), SPEC, seeded())
     obs = observation(5000)
     for logit, chance in ((30.0, 0.9), (-30.0, 0.1), (0.0, 0.5)):
         constant(high.actor.net, [logit])
@@ -394,7 +404,7 @@ def play(algo: RHMC, env: Env, steps: int) -> Iterator[Played]:
         table = options(2)
         s = env.step(action, extra["assignment"])
         t = Transition(
-            obs, action, s.reward, s.local, s.completed, s.terminal, s.truncated, s.final_obs, options, extra
+            obs, action, s.reward, s.local, s.completed, s.terminated, s.truncated, s.final_obs, options, extra
         )
         algo.observe(t)
         yield Played(t, table, algo.update())
@@ -403,7 +413,7 @@ def play(algo: RHMC, env: Env, steps: int) -> Iterator[Played]:
 
 def begin(world: str, batch: int, **changes: Any) -> tuple[RHMC, Env]:
     env = make_env(WORLDS[world], batch, seeded(4))
-    return RHMC(config(**{"buffer": 200, "horizon": 2} | changes), env.spec, batch, seeded(5)), env
+    return RHMC(config(**{"buffer_size": 200, "horizon": 2} | changes), env.spec, batch, seeded(5)), env
 
 
 @pytest.mark.parametrize("world", WORLDS)
@@ -415,7 +425,7 @@ def test_high_rows_are_those_of_the_periods_worked_out_one_by_one(world: str, re
     An episode of 7 steps cuts a period of 3 short: 3 + 3 + 1.
     """
     alpha = 0.3
-    algo, env = begin(world, 24, regulator=regulator, assignment_period=period, alpha=alpha, buffer=900)
+    algo, env = begin(world, 24, regulator=regulator, assignment_period=period, alpha=alpha, buffer_size=900)
     expected: list[dict[str, Any]] = []
     periods: list[dict[str, Any]] = [{} for _ in range(24)]
     for step, (t, table, _) in enumerate(play(algo, env, 17)):
@@ -438,7 +448,7 @@ def test_high_rows_are_those_of_the_periods_worked_out_one_by_one(world: str, re
         assert torch.equal(stored["assignment"][k], period_["held"])
         assert torch.equal(stored["pairs"][k], period_["pairs"])
         assert torch.equal(stored["next_pairs"][k], period_["next"])
-        assert not stored["terminal"][k]
+        assert not stored["terminated"][k]
     if regulator != "none":
         assert (stored["reward"] >= stored["earned"]).all()
         assert (stored["reward"] > stored["earned"]).any()
@@ -460,7 +470,7 @@ def test_low_rows_are_every_step_under_the_assignment_held() -> None:
     assert torch.equal(stored["action"], torch.cat([t.action for t in given]))
     assert torch.equal(stored["reward"], torch.cat([assigned_reward(t.local, t.extra["assignment"]) for t in given]))
     assert torch.equal(stored["next_pairs"], torch.cat([t.next_obs.pairs for t in given]))
-    assert not stored["terminal"].any()
+    assert not stored["terminated"].any()
 
 
 @pytest.mark.parametrize("period", [1, 3])
@@ -472,7 +482,7 @@ def test_an_assignment_is_held_for_its_period_and_drawn_anew_when_an_episode_sta
 
 
 def test_the_first_update_is_due_after_the_warm_up_and_then_at_the_set_rate() -> None:
-    algo, env = begin("coverage", 4, warmup=10, steps_per_update=8)
+    algo, env = begin("coverage", 4, learning_starts=10, train_freq=8)
     counts, before = [], 0
     for played in play(algo, env, 10):
         counts.append(algo.state_dict()["low"]["updates"])

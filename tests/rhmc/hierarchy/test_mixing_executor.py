@@ -9,9 +9,10 @@ from torch import Generator, Tensor, nn
 
 from rhmc.algorithms.rhmc import Config
 from rhmc.envs import coverage, make_env
-from rhmc.hierarchy.mixing_executor import MixedExecutor
+from rhmc.hierarchy.mixing_executor import QMIXExecutor
 from rhmc.learning.learner import pack
 from rhmc.types import Batch, Obs, Spec, Transition
+from tests.blocks import nested
 from tests.doubles import Known
 
 SPEC = Spec(2, 3, agent_features=1, pair_features=4, peer_features=0, actions=3, continuous=False, episode=9)
@@ -28,14 +29,14 @@ def _seed() -> None:
     torch.manual_seed(0)
 
 
-def executor(**changes: Any) -> MixedExecutor:
-    settings = {"executor": "mixed", "hidden": 16, "gamma_l": 0.5} | changes
-    return MixedExecutor(Config(**settings), SPEC, seeded())
+def executor(**changes: Any) -> QMIXExecutor:
+    settings = {"executor.method": "qmix", "hidden_dim": 16, "executor.gamma": 0.5} | changes
+    return QMIXExecutor(Config(**nested(settings)), SPEC, seeded())
 
 
 def rows(batch: int = 1, **changes: Tensor) -> Batch:
     obs = [Obs(torch.randn(batch, N, 1), torch.randn(batch, N, M, 4), torch.zeros(batch, N, N, 0), None) for _ in "ab"]
-    some = pack(obs[0]) | pack(obs[1], "next_") | {"terminal": torch.zeros(batch, dtype=torch.bool)}
+    some = pack(obs[0]) | pack(obs[1], "next_") | {"terminated": torch.zeros(batch, dtype=torch.bool)}
     held = (torch.rand(batch, N, M) < 0.5).float()
     return some | {"assignment": held, "action": torch.zeros(batch, N, dtype=torch.int64)} | changes
 
@@ -47,36 +48,36 @@ class Doubling(nn.Module):
         return (values * torch.tensor([2.0, 1.0])).sum(-1, keepdim=True) + 1
 
 
-def known(**changes: Any) -> MixedExecutor:
+def known(**changes: Any) -> QMIXExecutor:
     low = executor(lr=1e-9, **changes)
-    for net, values in ((low.q.net, NET), (low.q.slow, SLOW)):
+    for net, values in ((low.q.net, NET), (low.q.target_net, SLOW)):
         net.own, net.mixer = Known(values), Doubling()
     low.q.params = list(low.q.net.parameters())
-    low.q.slow_params = list(low.q.slow.parameters())
+    low.q.target_params = list(low.q.target_net.parameters())
     return low
 
 
-@pytest.mark.parametrize("terminal", [False, True])
-def test_target_by_hand(terminal: bool) -> None:
+@pytest.mark.parametrize("terminated", [False, True])
+def test_target_by_hand(terminated: bool) -> None:
     """The network chooses actions 1 and 2, the slow copy values them at 20 and 9; executors earn 0.5 and -1."""
-    reward, ended = torch.tensor([[0.5, -1.0]]), torch.tensor([terminal])
-    logs = known().update(rows(reward=reward, action=torch.tensor([[2, 0]]), terminal=ended))
-    target = -0.25 + (0 if terminal else 0.5 * (2 * 20 + 9 + 1))
+    reward, done = torch.tensor([[0.5, -1.0]]), torch.tensor([terminated])
+    logs = known().update(rows(reward=reward, action=torch.tensor([[2, 0]]), terminated=done))
+    target = -0.25 + (0 if terminated else 0.5 * (2 * 20 + 9 + 1))
     assert logs["low_td"].item() == pytest.approx((2 * 2 + 3 + 1 - target) ** 2, rel=1e-5)
 
 
 def test_rewards_are_standardised_before_they_are_averaged() -> None:
-    low = known(standardise_l="reward")
-    low.standard.see_rewards(torch.tensor([1.0, 3.0]))  # mean 2, deviation 1
+    low = known(executor__standardise="reward")
+    low.standardiser.update_rewards(torch.tensor([1.0, 3.0]))  # mean 2, deviation 1
     data = rows(reward=torch.tensor([[4.0, 3.0]]), action=torch.tensor([[2, 0]]))
     target = (2 + 1) / 2 + 0.5 * 50
     assert low.update(data)["low_td"].item() == pytest.approx((8 - target) ** 2, rel=1e-4)
 
 
 def test_returns_are_standardised_by_those_seen() -> None:
-    low = known(standardise_l="return")
-    low.standard.see_returns(torch.tensor([4.0, 8.0]))  # mean 6, deviation 2
-    low.standard.see_returns = lambda value: None  # type: ignore[method-assign]
+    low = known(executor__standardise="return")
+    low.standardiser.update_returns(torch.tensor([4.0, 8.0]))  # mean 6, deviation 2
+    low.standardiser.update_returns = lambda value: None  # type: ignore[method-assign]
     target = 0.5 + 0.5 * (50 * 2 + 6)
     data = rows(reward=torch.full((1, N), 0.5), action=torch.tensor([[2, 0]]))
     assert low.update(data)["low_td"].item() == pytest.approx((8 - (target - 6) / 2) ** 2, rel=1e-4)
@@ -104,7 +105,7 @@ def test_own_values_and_the_mixture_know_the_assignment() -> None:
 
 
 def test_explores_by_a_share_of_random_actions() -> None:
-    low = known(epsilon=0.3)
+    low = known(executor__epsilon=0.3)
     obs = Obs(torch.zeros(9000, N, 1), torch.zeros(9000, N, M, 4), torch.zeros(9000, N, N, 0), None)
     held = torch.zeros(9000, N, M)
     drawn = low.act(obs, held, seeded(), explore=True)
@@ -117,19 +118,19 @@ def test_explores_by_a_share_of_random_actions() -> None:
 @pytest.mark.parametrize(("reward", "scale"), list(product(("local", "team"), ("none", "reward"))))
 def test_rows_hold_what_is_paid_and_count_it_once(reward: str, scale: str) -> None:
     low, env = (
-        executor(low_reward=reward, standardise_l=scale),
+        executor(executor__reward=reward, executor__standardise=scale),
         make_env(coverage.Config(agents=N, targets=M), 5, seeded(1)),
     )
     obs, options = env.reset(), env.options()
     action, held = torch.ones(5, N, dtype=torch.int64), (torch.rand(5, N, M) < 0.4).float()
     s = env.step(action, held)
-    t = Transition(obs, action, s.reward, s.local, s.completed, s.terminal, s.truncated, s.final_obs, options, {})
+    t = Transition(obs, action, s.reward, s.local, s.completed, s.terminated, s.truncated, s.final_obs, options, {})
     kept = low.rows(t, held)
     if reward == "team":
         assert torch.equal(kept["reward"], s.reward.unsqueeze(-1).expand(5, N))
     else:
         assert not torch.allclose(kept["reward"][:, 0], kept["reward"][:, 1])
-    weight, total, _ = low.standard.sums
+    weight, total, _ = low.standardiser.sums
     assert (total / weight if scale == "reward" else total).item() == pytest.approx(
         kept["reward"].mean().item() if scale == "reward" else 0.0, rel=1e-4
     )
@@ -137,7 +138,7 @@ def test_rows_hold_what_is_paid_and_count_it_once(reward: str, scale: str) -> No
 
 def test_it_learns_which_joint_action_pays() -> None:
     """Rewards 1 for actions (2, 1), else 0, on states that say nothing."""
-    low = executor(encoder="pairwise", gamma_l=0.0, lr=0.01, filter="off", share=False)
+    low = executor(encoder="pairwise", executor__gamma=0.0, lr=0.01, filter="off", share=False)
     generator = seeded(3)
     for _ in range(150):
         action = torch.randint(3, (64, N), generator=generator)

@@ -33,9 +33,8 @@ def through_a_file(state: Any) -> Any:
 
 
 def experience(seed: int = 0, **changes: int) -> Experience:
-    return Experience(
-        OffPolicy(**{"buffer": 50, "batch": 4, "warmup": 10, "steps_per_update": 3} | changes), seeded(seed)
-    )
+    cfg = OffPolicy(**{"buffer_size": 50, "batch_size": 4, "learning_starts": 10, "train_freq": 3} | changes)
+    return Experience(cfg, cfg.batch_size, seeded(seed))
 
 
 def drawn(due: Experience) -> list[list[float]]:
@@ -46,7 +45,7 @@ def drawn(due: Experience) -> list[list[float]]:
 @given(st.lists(st.integers(1, 9), max_size=12), st.integers(0, 20), st.integers(1, 7))
 def test_an_update_is_due_for_every_few_steps_after_the_warm_up(counts: list[int], warmup: int, pace: int) -> None:
     """Whenever it is asked, and as often as it was not asked before."""
-    kept, steps, updates = experience(warmup=warmup, steps_per_update=pace), 0, 0
+    kept, steps, updates = experience(learning_starts=warmup, train_freq=pace), 0, 0
     for k, count in enumerate(counts):
         kept.add({"x": torch.arange(steps, steps + count).float()}, count)
         steps += count
@@ -58,7 +57,7 @@ def test_an_update_is_due_for_every_few_steps_after_the_warm_up(counts: list[int
 
 def test_steps_are_counted_and_not_rows() -> None:
     """A row may stand for a period of many steps, or be missing."""
-    kept = experience(warmup=0, steps_per_update=5)
+    kept = experience(learning_starts=0, train_freq=5)
     kept.add({"x": torch.ones(1)}, 10)
     assert len(drawn(kept)) == 2
     kept.add({"x": torch.ones(0)}, 5)
@@ -66,7 +65,7 @@ def test_steps_are_counted_and_not_rows() -> None:
 
 
 def test_nothing_is_due_from_an_empty_replay() -> None:
-    kept = experience(warmup=0)
+    kept = experience(learning_starts=0)
     kept.add({"x": torch.ones(0)}, 30)
     assert drawn(kept) == []
     kept.add({"x": torch.ones(1)}, 0)
@@ -74,7 +73,7 @@ def test_nothing_is_due_from_an_empty_replay() -> None:
 
 
 def test_a_batch_has_its_size_and_is_of_rows_seen() -> None:
-    kept = experience(batch=7, buffer=5)
+    kept = experience(batch_size=7, buffer_size=5)
     kept.add({"x": torch.arange(16).float()}, 16)
     got = drawn(kept)
     assert [len(batch) for batch in got] == [7, 7]
@@ -106,7 +105,7 @@ def observation(name: Tensor) -> Obs:
     return Obs(agents.clone(), pairs.clone(), torch.zeros(b, N, N, 0), torch.zeros(b, dtype=torch.bool))
 
 
-def step(t: int, batch: int = 4, terminal: Tensor | None = None, truncated: Tensor | None = None) -> Transition:
+def step(t: int, batch: int = 4, terminated: Tensor | None = None, truncated: Tensor | None = None) -> Transition:
     """Step t: environment b observes 100 t + b, and 100 t + b + 1/2 afterwards."""
     never, name = torch.zeros(batch, dtype=torch.bool), 100.0 * t + torch.arange(batch)
     return Transition(
@@ -115,7 +114,7 @@ def step(t: int, batch: int = 4, terminal: Tensor | None = None, truncated: Tens
         -name,
         Local(torch.zeros(batch, N, M), torch.zeros(batch, N)),
         torch.zeros(batch, N, M, dtype=torch.bool),
-        never if terminal is None else terminal,
+        never if terminated is None else terminated,
         never if truncated is None else truncated,
         observation(name + 0.5),
         lambda horizon: torch.zeros(0),
@@ -155,11 +154,11 @@ def test_the_next_rollout_starts_empty() -> None:
 def test_an_end_is_a_terminal_or_truncated_row() -> None:
     rollout = Rollout(1, CPU)
     over, cut = torch.tensor([0, 1, 0, 1]).bool(), torch.tensor([0, 0, 1, 1]).bool()
-    rollout.add(step(0, terminal=over, truncated=cut))
+    rollout.add(step(0, terminated=over, truncated=cut))
     rows = rollout.take()
     assert rows is not None
-    assert rows["terminal"].tolist() == [[False, True, False, True]]
-    assert rows["ended"].tolist() == [[False, True, True, True]]
+    assert rows["terminated"].tolist() == [[False, True, False, True]]
+    assert rows["done"].tolist() == [[False, True, True, True]]
 
 
 @pytest.mark.parametrize("before", range(4))
@@ -203,10 +202,10 @@ class Reader:
         return obs.agents[..., 0]
 
 
-def rollout_of(ended: Tensor) -> Batch:
-    rollout = Rollout(len(ended), CPU)
-    for t, row in enumerate(ended):
-        rollout.add(step(t, batch=ended.shape[1], truncated=row))
+def rollout_of(done: Tensor) -> Batch:
+    rollout = Rollout(len(done), CPU)
+    for t, row in enumerate(done):
+        rollout.add(step(t, batch=done.shape[1], truncated=row))
     rows = rollout.take()
     assert rows is not None
     return rows
@@ -222,9 +221,9 @@ shapes = st.tuples(st.integers(1, 5), st.integers(1, 4))
     )
 )
 def test_the_true_successor_is_asked_about_exactly_where_the_next_row_is_another(pattern: list[list[bool]]) -> None:
-    ended, network = torch.tensor(pattern), Reader()
-    value, following = values(network, rollout_of(ended))
-    length, batch = ended.shape
+    done, network = torch.tensor(pattern), Reader()
+    value, next_values = values(network, rollout_of(done))
+    length, batch = done.shape
     last = [(t, b) for t in range(length) for b in range(batch) if pattern[t][b] or t == length - 1]
     assert network.asked == [
         [100.0 * t + b for t in range(length) for b in range(batch)],
@@ -234,14 +233,14 @@ def test_the_true_successor_is_asked_about_exactly_where_the_next_row_is_another
         for b in range(batch):
             assert value[t, b].tolist() == [100.0 * t + b] * N
             after = 100.0 * t + b + 0.5 if (t, b) in last else 100.0 * (t + 1) + b
-            assert following[t, b].tolist() == [after] * N
+            assert next_values[t, b].tolist() == [after] * N
 
 
 def test_ends_and_their_successors_stand_in_one_order() -> None:
     rows = rollout_of(torch.tensor([[False, True, False], [True, False, False], [False, False, True]]))
-    kept = rows["ended"].clone()
+    kept = rows["done"].clone()
     last, after = ends(rows)
     assert last.tolist() == [[False, True, False], [True, False, False], [True, True, True]]
     assert after.agents[:, 0, 0].tolist() == [1.5, 100.5, 200.5, 201.5, 202.5]
     assert after.pairs.shape == (5, N, M, 2)
-    assert torch.equal(rows["ended"], kept)
+    assert torch.equal(rows["done"], kept)

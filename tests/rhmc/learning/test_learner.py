@@ -118,33 +118,33 @@ def params(module: nn.Module) -> list[Tensor]:
 
 
 def test_the_slow_copy_follows_by_the_share_not_kept() -> None:
-    learner = Learner(net(), lr=0.1, polyak=0.75)
-    assert all(torch.equal(a, b) for a, b in zip(params(learner.net), params(learner.slow), strict=True))
-    slow = params(learner.slow)
+    learner = Learner(net(), lr=0.1, tau=0.25)
+    assert all(torch.equal(a, b) for a, b in zip(params(learner.net), params(learner.target_net), strict=True))
+    slow = params(learner.target_net)
     for _ in range(3):
         learner.update(learner.net(INPUT).square().mean())
         fast = params(learner.net)
         slow = [0.75 * s + 0.25 * f for s, f in zip(slow, fast, strict=True)]
-        assert all(torch.allclose(a, b, atol=1e-7) for a, b in zip(params(learner.slow), slow, strict=True))
-        assert not any(torch.equal(a, b) for a, b in zip(fast, params(learner.slow), strict=True))
+        assert all(torch.allclose(a, b, atol=1e-7) for a, b in zip(params(learner.target_net), slow, strict=True))
+        assert not any(torch.equal(a, b) for a, b in zip(fast, params(learner.target_net), strict=True))
 
 
-@pytest.mark.parametrize(("polyak", "follows"), [(1.0, False), (0.0, True)])
-def test_the_ends_of_polyak_averaging(polyak: float, follows: bool) -> None:
-    learner = Learner(net(), lr=0.1, polyak=polyak)
-    before = params(learner.slow)
+@pytest.mark.parametrize(("tau", "follows"), [(0.0, False), (1.0, True)])
+def test_the_ends_of_the_share_moved(tau: float, follows: bool) -> None:
+    learner = Learner(net(), lr=0.1, tau=tau)
+    before = params(learner.target_net)
     learner.update(learner.net(INPUT).mean())
     expected = params(learner.net) if follows else before
-    assert all(torch.allclose(a, b) for a, b in zip(params(learner.slow), expected, strict=True))
+    assert all(torch.allclose(a, b) for a, b in zip(params(learner.target_net), expected, strict=True))
 
 
 def test_the_slow_copy_takes_no_gradient_even_when_the_loss_goes_through_it() -> None:
-    learner = Learner(net(), lr=0.1, polyak=1.0)
-    before = params(learner.slow)
-    learner.update((learner.net(INPUT) - learner.slow(INPUT + 1)).square().mean())
-    assert not learner.slow(INPUT).requires_grad
-    assert all(p.grad is None and not p.requires_grad for p in learner.slow.parameters())
-    assert all(torch.equal(a, b) for a, b in zip(before, params(learner.slow), strict=True))
+    learner = Learner(net(), lr=0.1, tau=0.0)
+    before = params(learner.target_net)
+    learner.update((learner.net(INPUT) - learner.target_net(INPUT + 1)).square().mean())
+    assert not learner.target_net(INPUT).requires_grad
+    assert all(p.grad is None and not p.requires_grad for p in learner.target_net.parameters())
+    assert all(torch.equal(a, b) for a, b in zip(before, params(learner.target_net), strict=True))
 
 
 def test_a_step_is_adams() -> None:
@@ -159,7 +159,7 @@ def test_a_step_is_adams() -> None:
 
 
 def test_the_gradient_is_cut_to_the_largest_norm_and_its_own_norm_returned() -> None:
-    learner = Learner(net(), lr=0.01, clip=0.5)
+    learner = Learner(net(), lr=0.01, max_grad_norm=0.5)
     loss = 1000 * learner.net(INPUT).square().mean()
     raw = torch.cat([g.flatten() for g in torch.autograd.grad(loss, learner.params, retain_graph=True)])
     assert raw.norm() > 50
@@ -169,7 +169,7 @@ def test_the_gradient_is_cut_to_the_largest_norm_and_its_own_norm_returned() -> 
 
 
 def test_a_small_gradient_is_left_as_it_is() -> None:
-    learner = Learner(net(), lr=0.01, clip=1e6)
+    learner = Learner(net(), lr=0.01, max_grad_norm=1e6)
     loss = learner.net(INPUT).square().mean()
     raw = torch.autograd.grad(loss, learner.params, retain_graph=True)
     learner.update(loss)
@@ -178,25 +178,25 @@ def test_a_small_gradient_is_left_as_it_is() -> None:
 
 
 def test_gradients_do_not_add_up_over_updates() -> None:
-    learner = Learner(net(), lr=0.0, clip=1e6)
+    learner = Learner(net(), lr=0.0, max_grad_norm=1e6)
     norms = [learner.update(learner.net(INPUT).square().mean()).item() for _ in range(3)]
     assert norms == [norms[0]] * 3
 
 
 def test_other_networks_in_the_loss_are_left_alone() -> None:
     learner, other = Learner(net(0), lr=0.1), Learner(net(1), lr=0.1)
-    before = params(other.net) + params(other.slow)
+    before = params(other.net) + params(other.target_net)
     learner.update((learner.net(INPUT) * other.net(INPUT)).mean())
-    assert all(torch.equal(a, b) for a, b in zip(before, params(other.net) + params(other.slow), strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(before, params(other.net) + params(other.target_net), strict=True))
     assert all(p.grad is None for p in other.net.parameters())
 
 
 @pytest.mark.parametrize("updates", [0, 3])
 def test_a_learner_continues_from_its_state(updates: int) -> None:
     def step(learner: Learner) -> None:
-        learner.update((learner.net(INPUT) - learner.slow(INPUT).cos()).square().mean())
+        learner.update((learner.net(INPUT) - learner.target_net(INPUT).cos()).square().mean())
 
-    learner, other = Learner(net(0), lr=0.05, polyak=0.9), Learner(net(1), lr=0.05, polyak=0.9)
+    learner, other = Learner(net(0), lr=0.05, tau=0.1), Learner(net(1), lr=0.05, tau=0.1)
     step(other)
     for _ in range(updates):
         step(learner)

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from rhmc.learning.normalisation import KEPT, LEAST, Standard
+from rhmc.learning.normalisation import KEPT, LEAST, Standardiser
 from tests.conformance import assert_same
 
 CPU = torch.device("cpu")
@@ -26,9 +26,9 @@ def moments(seen: list[list[float]]) -> tuple[float, float]:
     return mean, max(float(np.sqrt(np.average((values - mean) ** 2, weights=voices))), LEAST)
 
 
-def seen(standard: Standard, batches: list[list[float]], *, returns: bool = False) -> Standard:
+def updated(standard: Standardiser, batches: list[list[float]], *, returns: bool = False) -> Standardiser:
     for batch in batches:
-        (standard.see_returns if returns else standard.see_rewards)(torch.tensor(batch))
+        (standard.update_returns if returns else standard.update_rewards)(torch.tensor(batch))
     return standard
 
 
@@ -36,7 +36,7 @@ def seen(standard: Standard, batches: list[list[float]], *, returns: bool = Fals
 @given(batches, st.floats(-50, 50))
 def test_rewards_get_mean_0_and_deviation_1_of_what_was_seen(batches: list[list[float]], reward: float) -> None:
     mean, deviation = moments(batches)
-    paid = seen(Standard("reward", CPU), batches).reward(torch.tensor(reward, dtype=torch.float32))
+    paid = updated(Standardiser("reward", CPU), batches).reward(torch.tensor(reward, dtype=torch.float32))
     # A variance far below the values' squares is the small difference of large numbers: to the float's digits only.
     slack = 1e-3 + 5e-7 * (max(abs(x) for batch in batches for x in batch) / deviation) ** 2
     assert float(paid) * deviation == pytest.approx(reward - mean, rel=slack, abs=slack)
@@ -46,7 +46,7 @@ def test_rewards_get_mean_0_and_deviation_1_of_what_was_seen(batches: list[list[
 @given(batches, st.floats(-50, 50))
 def test_a_network_predicts_returns_of_mean_0_and_deviation_1(batches: list[list[float]], output: float) -> None:
     mean, deviation = moments(batches)
-    standard = seen(Standard("return", CPU), batches, returns=True)
+    standard = updated(Standardiser("return", CPU), batches, returns=True)
     x = torch.tensor(output, dtype=torch.float32)
     assert torch.allclose(standard.target(standard.value(x)), x, atol=1e-2)
     slack = 1e-2 + 1e-4 * max(abs(x) for batch in batches for x in batch) / deviation
@@ -55,28 +55,28 @@ def test_a_network_predicts_returns_of_mean_0_and_deviation_1(batches: list[list
 
 def test_the_first_batch_counts_in_full() -> None:
     """The start of the average at zero is corrected for: without it, the mean would be a thousandth of 3."""
-    standard = seen(Standard("reward", CPU), [[1.0, 5.0]])
+    standard = updated(Standardiser("reward", CPU), [[1.0, 5.0]])
     assert standard.reward(torch.tensor([1.0, 3.0, 5.0])).tolist() == pytest.approx([-1.0, 0.0, 1.0], abs=1e-3)
 
 
 def test_old_batches_are_forgotten() -> None:
-    standard = seen(Standard("reward", CPU), [[0.0, 2.0]] * 50 + [[10.0, 14.0]] * 8000)
+    standard = updated(Standardiser("reward", CPU), [[0.0, 2.0]] * 50 + [[10.0, 14.0]] * 8000)
     assert standard.reward(torch.tensor([12.0, 14.0])).tolist() == pytest.approx([0.0, 1.0], abs=0.02)
 
 
 @pytest.mark.parametrize("mode", ["none", "reward", "return"])
 def test_before_anything_is_seen_everything_stays_as_it_is(mode: str) -> None:
-    standard, x = Standard(mode, CPU), torch.tensor([-3.0, 0.5])  # type: ignore[arg-type]
+    standard, x = Standardiser(mode, CPU), torch.tensor([-3.0, 0.5])  # type: ignore[arg-type]
     for there in (standard.reward, standard.value, standard.target):
         assert torch.equal(there(x), x)
 
 
 @pytest.mark.parametrize("mode", ["reward", "return"])
 def test_nothing_seen_changes_nothing(mode: str) -> None:
-    standard = Standard(mode, CPU)  # type: ignore[arg-type]
+    standard = Standardiser(mode, CPU)  # type: ignore[arg-type]
     for values in ([], [2.0, 4.0], []):
-        standard.see_rewards(torch.tensor(values))
-        standard.see_returns(torch.tensor(values))
+        standard.update_rewards(torch.tensor(values))
+        standard.update_returns(torch.tensor(values))
     there = standard.reward if mode == "reward" else standard.target
     assert there(torch.tensor([2.0, 4.0])).tolist() == pytest.approx([-1.0, 1.0], abs=1e-3)
 
@@ -85,9 +85,9 @@ def test_nothing_seen_changes_nothing(mode: str) -> None:
 def test_a_mode_touches_its_own_numbers_only(mode: str) -> None:
     """`reward` scales rewards by the rewards seen, `return` values by the returns seen, `none` nothing."""
     x = torch.tensor([6.0, 10.0])
-    standard = Standard(mode, CPU)  # type: ignore[arg-type]
-    standard.see_rewards(torch.tensor([7.0, 9.0]))
-    standard.see_returns(torch.tensor([0.0, 4.0]))
+    standard = Standardiser(mode, CPU)  # type: ignore[arg-type]
+    standard.update_rewards(torch.tensor([7.0, 9.0]))
+    standard.update_returns(torch.tensor([0.0, 4.0]))
 
     def close(got: Tensor, want: list[float]) -> None:
         assert got.tolist() == pytest.approx(want, abs=5e-3)
@@ -98,21 +98,21 @@ def test_a_mode_touches_its_own_numbers_only(mode: str) -> None:
 
 
 def test_the_deviation_has_a_floor() -> None:
-    standard = seen(Standard("reward", CPU), [[5.0, 5.0]])
+    standard = updated(Standardiser("reward", CPU), [[5.0, 5.0]])
     assert standard.reward(torch.tensor(5.0 + LEAST)).item() == pytest.approx(1.0, abs=0.05)
 
 
 @pytest.mark.parametrize("mode", ["none", "reward", "return"])
 def test_a_checkpoint_continues_bit_for_bit(mode: str) -> None:
-    first, other = (Standard(mode, CPU) for _ in range(2))  # type: ignore[arg-type]
+    first, other = (Standardiser(mode, CPU) for _ in range(2))  # type: ignore[arg-type]
     for standard in (first, other):
-        standard.see_rewards(torch.tensor([1.0, 2.0, 4.0]))
-        standard.see_returns(torch.tensor([8.0, 16.0]))
-    fresh = Standard(mode, CPU)  # type: ignore[arg-type]
+        standard.update_rewards(torch.tensor([1.0, 2.0, 4.0]))
+        standard.update_returns(torch.tensor([8.0, 16.0]))
+    fresh = Standardiser(mode, CPU)  # type: ignore[arg-type]
     fresh.load_state_dict(first.state_dict())
     for standard in (fresh, other):
-        standard.see_rewards(torch.tensor([3.0, 9.0]))
-        standard.see_returns(torch.tensor([-3.0, 9.0]))
+        standard.update_rewards(torch.tensor([3.0, 9.0]))
+        standard.update_returns(torch.tensor([-3.0, 9.0]))
     assert_same(fresh.state_dict(), other.state_dict())
     x = torch.tensor([0.1, 20.0])
     for name in ("reward", "value", "target"):

@@ -19,9 +19,9 @@ class Rows(NamedTuple):
 
     reward: Tensor
     value: Tensor
-    following: Tensor
-    terminal: Tensor
-    ended: Tensor
+    next_values: Tensor
+    terminated: Tensor
+    done: Tensor
 
     def each(self, per_row: "Callable[[Rows, int, int], float]") -> Tensor:
         """(T, B) from one number at a time."""
@@ -30,21 +30,21 @@ class Rows(NamedTuple):
 
     def reach(self, t: int, b: int) -> int:
         """Rows from t to the end of the episode or of the sequence, t included."""
-        rest = self.ended[t:, b].tolist()
+        rest = self.done[t:, b].tolist()
         return rest.index(True) + 1 if True in rest else len(rest)
 
 
 def rows_of(codes: list[list[int]], seed: int = 0) -> Rows:
     """Random numbers around a pattern (T, B) of `GOING`, `CUT` and `OVER`."""
     code, rng = torch.tensor(codes), torch.Generator().manual_seed(seed)
-    reward, value, following = torch.randn(3, *code.shape, generator=rng, dtype=torch.float64)
-    return Rows(reward, value, following, code == OVER, code != GOING)
+    reward, value, next_values = torch.randn(3, *code.shape, generator=rng, dtype=torch.float64)
+    return Rows(reward, value, next_values, code == OVER, code != GOING)
 
 
-def one(reward: list[float], value: list[float], following: list[float], codes: list[int]) -> Rows:
+def one(reward: list[float], value: list[float], next_values: list[float], codes: list[int]) -> Rows:
     """A single sequence."""
     code = torch.tensor(codes).view(-1, 1)
-    numbers = (torch.tensor(x, dtype=torch.float64).view(-1, 1) for x in (reward, value, following))
+    numbers = (torch.tensor(x, dtype=torch.float64).view(-1, 1) for x in (reward, value, next_values))
     return Rows(next(numbers), next(numbers), next(numbers), code == OVER, code != GOING)
 
 
@@ -66,7 +66,7 @@ def some_steps(rows: Rows, t: int, b: int, steps: int, gamma: float) -> float:
     """`steps` rewards, then the value of what follows the last of them unless nothing does."""
     rewards = sum(gamma**k * float(rows.reward[t + k, b]) for k in range(steps))
     last = t + steps - 1
-    return rewards + (0.0 if rows.terminal[last, b] else gamma**steps * float(rows.following[last, b]))
+    return rewards + (0.0 if rows.terminated[last, b] else gamma**steps * float(rows.next_values[last, b]))
 
 
 def lambda_return(rows: Rows, t: int, b: int, gamma: float, lam: float) -> float:
@@ -86,7 +86,7 @@ def test_td_lambda_is_the_weighted_sum_of_all_returns_ahead(
     codes: list[list[int]], seed: int, gamma: float, lam: float
 ) -> None:
     rows = rows_of(codes, seed)
-    got = td_lambda(rows.reward, rows.following, rows.terminal, rows.ended, gamma, lam)
+    got = td_lambda(rows.reward, rows.next_values, rows.terminated, rows.done, gamma, lam)
     assert torch.allclose(
         got, rows.each(lambda rows, t, b: lambda_return(rows, t, b, gamma, lam)), rtol=1e-12, atol=1e-12
     )
@@ -96,7 +96,7 @@ def test_td_lambda_is_the_weighted_sum_of_all_returns_ahead(
 @given(patterns, st.integers(0, 99), shares, st.integers(1, 9))
 def test_n_step_counts_rewards_up_to_the_end(codes: list[list[int]], seed: int, gamma: float, n: int) -> None:
     rows = rows_of(codes, seed)
-    got = n_step(rows.reward, rows.following, rows.terminal, rows.ended, gamma, n)
+    got = n_step(rows.reward, rows.next_values, rows.terminated, rows.done, gamma, n)
     want = rows.each(lambda rows, t, b: some_steps(rows, t, b, min(n, rows.reach(t, b)), gamma))
     assert torch.allclose(got, want, rtol=1e-12, atol=1e-12)
 
@@ -119,8 +119,8 @@ def test_gae_and_the_lambda_return_say_the_same_where_values_agree(
     """Their difference is the value, once the value of a row is what the row before it expects."""
     rows = rows_of(codes, seed)
     value = rows.value.clone()
-    value[1:] = torch.where(rows.ended[:-1], value[1:], rows.following[:-1])
-    target = td_lambda(rows.reward, rows.following, rows.terminal, rows.ended, gamma, lam)
+    value[1:] = torch.where(rows.done[:-1], value[1:], rows.next_values[:-1])
+    target = td_lambda(rows.reward, rows.next_values, rows.terminated, rows.done, gamma, lam)
     assert torch.allclose(gae(*rows._replace(value=value), gamma, lam) + value, target, rtol=1e-12, atol=1e-12)
 
 
@@ -128,11 +128,11 @@ def test_gae_and_the_lambda_return_say_the_same_where_values_agree(
 @given(patterns, st.integers(0, 99))
 def test_what_follows_a_terminal_row_does_not_count(codes: list[list[int]], seed: int) -> None:
     rows = rows_of(codes, seed)
-    changed = rows._replace(following=torch.where(rows.terminal, 1e6, rows.following))
+    changed = rows._replace(next_values=torch.where(rows.terminated, 1e6, rows.next_values))
     assert torch.equal(gae(*changed, 0.9, 0.8), gae(*rows, 0.9, 0.8))
     others: list[Callable[[Rows], Tensor]] = [
-        lambda x: td_lambda(x.reward, x.following, x.terminal, x.ended, 0.9, 0.8),
-        lambda x: n_step(x.reward, x.following, x.terminal, x.ended, 0.9, 3),
+        lambda x: td_lambda(x.reward, x.next_values, x.terminated, x.done, 0.9, 0.8),
+        lambda x: n_step(x.reward, x.next_values, x.terminated, x.done, 0.9, 3),
     ]
     assert all(torch.equal(returns(changed), returns(rows)) for returns in others)
 
@@ -150,14 +150,14 @@ def test_what_follows_a_terminal_row_does_not_count(codes: list[list[int]], seed
 )
 def test_td_lambda_by_hand(middle: int, want: list[float]) -> None:
     rows = one([1.0, 2.0, 4.0], [0.0] * 3, [2.0, 4.0, 8.0], [GOING, middle, GOING])
-    got = td_lambda(rows.reward, rows.following, rows.terminal, rows.ended, 0.5, 0.5)
+    got = td_lambda(rows.reward, rows.next_values, rows.terminated, rows.done, 0.5, 0.5)
     assert got.flatten().tolist() == want
 
 
 @pytest.mark.parametrize(
     ("middle", "n", "want"),
     [
-        (GOING, 1, [2.0, 4.0, 8.0]),  # reward + following/2
+        (GOING, 1, [2.0, 4.0, 8.0]),  # reward + next_values/2
         (GOING, 2, [3.0, 6.0, 8.0]),  # 1 + 2/2 + 4/4; 2 + 4/2 + 8/4; no second reward
         (GOING, 3, [4.0, 6.0, 8.0]),  # 1 + 2/2 + 4/4 + 8/8
         (CUT, 3, [3.0, 4.0, 8.0]),
@@ -166,7 +166,7 @@ def test_td_lambda_by_hand(middle: int, want: list[float]) -> None:
 )
 def test_n_step_by_hand(middle: int, n: int, want: list[float]) -> None:
     rows = one([1.0, 2.0, 4.0], [0.0] * 3, [2.0, 4.0, 8.0], [GOING, middle, GOING])
-    got = n_step(rows.reward, rows.following, rows.terminal, rows.ended, 0.5, n)
+    got = n_step(rows.reward, rows.next_values, rows.terminated, rows.done, 0.5, n)
     assert got.flatten().tolist() == want
 
 
@@ -191,19 +191,19 @@ def test_values_of_every_agent_share_the_rewards_and_the_ends(dtype: torch.dtype
     """(T, B, N) values beside (T, B, 1) rewards are N sequences of their own; nothing given is written to."""
     rows = rows_of([[GOING, OVER], [CUT, GOING], [GOING, GOING]])
     reward = rows.reward.to(dtype).unsqueeze(-1)
-    value, following = torch.randn(2, 3, 2, 4, dtype=dtype)
-    terminal, ended = rows.terminal.unsqueeze(-1), rows.ended.unsqueeze(-1)
-    given = [x.clone() for x in (reward, value, following, terminal, ended)]
+    value, next_values = torch.randn(2, 3, 2, 4, dtype=dtype)
+    terminated, done = rows.terminated.unsqueeze(-1), rows.done.unsqueeze(-1)
+    given = [x.clone() for x in (reward, value, next_values, terminated, done)]
     calls: list[Callable[..., Tensor]] = [
         lambda r, v, f, t, e: gae(r, v, f, t, e, 0.9, 0.8),
         lambda r, v, f, t, e: td_lambda(r, f, t, e, 0.9, 0.8),
         lambda r, v, f, t, e: n_step(r, f, t, e, 0.9, 2),
     ]
     for call in calls:
-        whole = call(reward, value, following, terminal, ended)
+        whole = call(reward, value, next_values, terminated, done)
         assert whole.shape == (3, 2, 4)
         assert whole.dtype == dtype
         for i in range(4):
-            alone = call(reward[..., 0], value[..., i], following[..., i], terminal[..., 0], ended[..., 0])
+            alone = call(reward[..., 0], value[..., i], next_values[..., i], terminated[..., 0], done[..., 0])
             assert torch.equal(whole[..., i], alone)
-    assert all(torch.equal(a, b) for a, b in zip(given, (reward, value, following, terminal, ended), strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(given, (reward, value, next_values, terminated, done), strict=True))

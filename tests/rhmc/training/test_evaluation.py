@@ -12,6 +12,7 @@ from rhmc.training.evaluation import CHUNK, Episodes, evaluate
 from rhmc.training.trainer import Config, Trainer
 from rhmc.types import Obs, Transition
 from tests import toy
+from tests.blocks import fitted, nested
 from tests.conformance import assert_same
 
 SHORT = navigation.Config(episode=4, agents=2)
@@ -139,8 +140,8 @@ def test_means_and_the_standard_error() -> None:
 @pytest.mark.parametrize("kind", ALGORITHMS)
 def test_evaluating_leaves_the_run_and_the_global_generator_untouched_and_repeats_itself(kind: str) -> None:
     config = ALGORITHMS[kind].config
-    small = {"hidden": 8, "buffer": 30, "batch": 8, "batch_h": 8, "warmup": 8, "steps_per_update": 4}
-    algo = config(**{key: value for key, value in small.items() if key in config.model_fields})
+    small = {"hidden_dim": 8, "buffer_size": 30, "batch_size": 8, "learning_starts": 8, "train_freq": 4}
+    algo = config(**nested(fitted(config, small)))
     cfg = Config(steps=40, num_envs=4, evaluations=2, eval_episodes=2, final_episodes=2)
     run = Trainer(SHORT, algo, cfg, seed=0)
     next(run)

@@ -17,6 +17,7 @@ from rhmc.learning.learner import Learner, Learners
 from rhmc.training.trainer import Config, Means, Trainer, grid_step
 from rhmc.types import Frozen, Metrics, Obs, Spec, Transition
 from tests import toy
+from tests.blocks import fitted, nested
 from tests.conformance import assert_same
 
 ENVIRONMENTS = 4
@@ -174,13 +175,13 @@ def test_exploring_while_training_and_greedy_while_evaluating() -> None:
     assert evaluated == [False] * (5 * toy.EPISODE)
 
 
-SMALL = {"hidden": 8, "buffer": 30, "batch": 8, "batch_h": 8, "warmup": 8, "steps_per_update": 4}
-SMALL |= {"rollout": 3, "epochs": 2, "minibatches": 2, "pretrain": 20, "assignment_period": 1}
+SMALL = {"hidden_dim": 8, "buffer_size": 30, "batch_size": 8, "learning_starts": 8, "train_freq": 4}
+SMALL |= {"n_steps": 3, "epochs": 2, "minibatches": 2, "pretrain": 20, "assignment_period": 1}
 
 
 def method(kind: str) -> Any:
     config = ALGORITHMS[kind].config
-    return config(**{key: value for key, value in SMALL.items() if key in config.model_fields})
+    return config(**nested(fitted(config, SMALL)))
 
 
 METHODS = [kind for kind in ALGORITHMS if kind != "recorder"]
@@ -247,7 +248,7 @@ def test_means() -> None:
 @pytest.mark.parametrize("left", [1.0, 0.2, 0.0])
 def test_step_sizes_fall_in_a_line_to_what_is_left_of_them(left: float) -> None:
     """Budget of 60 in steps of 4: the update after k steps has 1 - (1 - left) k / 60 of the size."""
-    run = trainer(anneal=left)
+    run = trainer(final_lr_fraction=left)
     sizes: list[float] = []
     learner, update = run.algorithm.learners()[0], run.algorithm.update
 
