@@ -17,8 +17,8 @@ from rhmc.envs import coverage, make_env
 from rhmc.learning.learner import Learner, pack, unpack
 from rhmc.learning.schedules import linear
 from rhmc.networks.nets import ENCODERS, Sizes
-from rhmc.scripted.coverage import planner
 from rhmc.types import Batch, Obs
+from rhmc.yardsticks.coverage import planner
 
 CFG = coverage.Config(observation="extended")
 COPIES, KEPT, ROWS = 128, 1500, 2  # environments, steps kept, steps of an update

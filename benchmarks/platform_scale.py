@@ -173,7 +173,7 @@ def fill(file: Path, home: Path, leave: int) -> int:
         copies = {table: Rows(database, table, model) for table in ("runs", "tags", "params", *METRICS)}
         for i, item in enumerate(todo[: len(todo) - leave]):
             card, ref, better = item.card, f"{i:032x}", random.Random(i).random()
-            about = {"variant": card.arm, "seed": str(card.seed), "spec": card.spec_id, "mlflow.runName": card.name}
+            about = {"arm": card.arm, "seed": str(card.seed), "spec": card.spec_id, "mlflow.runName": card.name}
             copies["runs"].write({"run_uuid": ref, "name": card.name}, {})
             copies["tags"].write({"run_uuid": ref}, about)
             copies["params"].write({"run_uuid": ref}, card.params)

@@ -135,7 +135,7 @@ class Evidence:
         return found
 
     def bound(self, policy: str) -> Interval | None:
-        """A scripted policy on the task of the coverage studies: mean and twice its standard error, if it was run."""
+        """A yardstick on the task of the coverage studies: mean and twice its standard error, if it was run."""
         self.asked.add(YARDSTICKS)
         for table in map(self.results.yardsticks_of, ("coverage", "ablation")):
             if policy in table.index and FINAL in table:

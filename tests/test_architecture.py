@@ -43,7 +43,7 @@ ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
         "types": (),
         "registry": (),
         "envs": ("types", "registry"),
-        "scripted": ("envs",),
+        "yardsticks": ("envs",),
         "networks": ("types",),
         "learning": ("types", "networks"),
         "hierarchy": ("types", "networks", "learning"),
@@ -498,7 +498,7 @@ FOR_COPYING = "template"  # answers no question of the report
 
 
 def test_every_study_is_in_the_pipeline(stages: dict) -> None:
-    """A search is run by hand: what it finds is kept in `studies/found`, and a study that includes it is here."""
+    """A search is run by hand: what it finds is kept in `studies/best_params`, and a study that includes it is here."""
     studies = {p.stem for p in (ROOT / "studies").glob("*.yaml") if not is_search(p)} - {FOR_COPYING}
     stage, queue = stages["studies"], stages["vars"]["queue"].split()
     check, *commands = stage["cmd"]

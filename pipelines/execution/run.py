@@ -337,7 +337,7 @@ def show_status(study: Study, home: Path, *, as_json: bool = False) -> int:
         rows = [[arm, *(str(one[c]) for c in columns)] for arm, one in found.arms.items()]
         print_table(terminal(), ["arm", *columns], rows)
         lines = [f"failed: {name}: {error}" for name, error in found.errors.items()]
-        lines += [*found.stale, *(f"note: {remark}" for remark in study.remarks)]
+        lines += [*found.stale, *(f"note: {remark}" for remark in (*study.remarks, *found.remarks))]
         terminal().print("\n".join(map(visible, lines)), soft_wrap=True, end="\n" if lines else "")
     return DONE if found.finished else FAILED
 
@@ -349,6 +349,7 @@ class Standing(NamedTuple):
     arms: dict[str, dict[str, int]]  # runs by state
     errors: dict[str, str]  # of each failed run, by its name
     stale: list[str]  # why runs are no part of the plan, a line for each arm and reason
+    remarks: list[str]  # of the log
 
 
 def _status(study: Study, home: Home) -> Standing:
@@ -370,4 +371,4 @@ def _status(study: Study, home: Home) -> Standing:
     failed = {(run.arm, run.key): run.error for run in recorded if run.status == "failed"}
     errors = {item.name: failed[item.card.arm, item.key] for item in plan if (item.card.arm, item.key) in failed}
     why = reasons(plan, recorded, tracker) if tracker else []
-    return Standing(planned <= finished(recorded), arms, errors, why)
+    return Standing(planned <= finished(recorded), arms, errors, why, tracker.remarks if tracker else [])

@@ -1,7 +1,7 @@
 """`include` in a section of a study: the section starts from that of another file, such as the winner of a search.
 
     arms:
-      RHMC: {algo: {include: found/search_rhmc.rhmc.paper.yaml, horizon: 2}}
+      RHMC: {algo: {include: best_params/search_rhmc.rhmc.paper.yaml, horizon: 2}}
 
 The path is relative to the folder of the file that includes. What stands beside `include` goes before what is included.
 Every value keeps the place where it was written, so that a fault points into the included file.

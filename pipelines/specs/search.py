@@ -42,7 +42,7 @@ from pipelines.specs.study import (
 from rhmc.types import Frozen
 
 FIRST_SEED = 500_000  # a search trains on seeds of its own, so that a study tries its winner on others
-EVAL_SEED = 20_000_000  # and evaluates on banks of its own, unless the file names others
+EVAL_SEED = 20_000_000  # evaluation episodes of its own, unless the file names others
 COMBINATIONS = 2_000  # of extremes, that are tried in a check
 COUNTS = ("trials", "seeds", "steps")
 

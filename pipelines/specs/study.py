@@ -102,7 +102,7 @@ class Setting(Frozen):
 class RunSpec(Setting):
     """All that decides a run's result, the code and its libraries aside."""
 
-    seed: int = Field(ge=0, lt=1_000_000)  # the evaluation banks' generators are seeded from 10 million on
+    seed: int = Field(ge=0, lt=1_000_000)  # the generators of evaluation episodes are seeded from 10 million on
 
     @property
     def id(self) -> str:

@@ -66,6 +66,11 @@ NOTE = "mlflow.note.content"  # the tag that MLflow shows as a description
 LONGEST = 8000  # characters of a run's tag
 MODULES = "modules"  # tag of a run: the digests of its code as JSON
 TRACE = "error.txt"  # a run's file with why it failed
+ARM = "arm"  # tag of a run; a run without it was logged by an older version
+OLDER = (
+    "{} runs of an older version (no tag 'arm') in the log are set aside; `rhmc study run` trains the study anew, "
+    "the version that logged them reads them"
+)
 ARMS = "arms"  # the experiment's tag with its arms as JSON, in the order in which they came: it decides their colours
 COLOURED = 100  # arms that the tag has room for; a view shows no more
 
@@ -104,6 +109,8 @@ class MlflowTracker:
             self.parent = self._parent() if write else None
             if write:
                 self._interrupt_running()
+            if older := len(self._search(f"tags.role = 'run' and tags.{ARM} IS NULL")):
+                self.remarks.append(OLDER.format(older))
 
     def _experiment(self, home: Home, write: bool) -> str | None:
         name = experiment_name(self.study)
@@ -133,9 +140,6 @@ class MlflowTracker:
         arms = [*known, *(arm for arm in self.study.arms if arm not in known)][:COLOURED]
         if arms != known:
             self.client.set_experiment_tag(self.experiment, ARMS, json.dumps(arms, ensure_ascii=False))
-        for run in self._search(f"tags.role = 'run' and tags.{legend.TAG} IS NULL"):  # of an earlier version
-            look = self._look(run.data.tags.get("variant", ""), arms)
-            self.client.log_batch(run.info.run_id, tags=[RunTag(*pair) for pair in look])
         return arms
 
     @staticmethod
@@ -169,7 +173,7 @@ class MlflowTracker:
         self.client.set_experiment_tag(self.experiment, NOTE, note)
         self.client.set_tag(ref, NOTE, note)
 
-    def _only(self, query: str, name: str, tags: dict[str, str], variant: str | None = None) -> Run:
+    def _only(self, query: str, name: str, tags: dict[str, str], arm: str | None = None) -> Run:
         """The one run that matches, made if there is none.
 
         A request whose answer is lost is sent again, and then a server that was killed may have made the run twice.
@@ -178,7 +182,7 @@ class MlflowTracker:
 
         def there() -> list[Run]:
             found = self._search(query)
-            return found if variant is None else [run for run in found if run.data.tags["variant"] == variant]
+            return found if arm is None else [run for run in found if run.data.tags.get(ARM) == arm]
 
         runs = there()
         if not runs:
@@ -223,13 +227,14 @@ class MlflowTracker:
         return {run.key: run.ref for run in runs if run.key in keys}
 
     def _listed(self, experiments: Sequence[str]) -> list[tuple[str, Recorded]]:
-        """Experiment and run of all runs there, oldest first."""
+        """Experiment and run of all runs there, oldest first; those of an older version are left out."""
         with explained(self.uri):
             sqlite = self.uri.startswith("sqlite:")
             return self._listed_sqlite(experiments) if sqlite else self._listed_client(experiments)
 
     def _listed_client(self, experiments: Sequence[str]) -> list[tuple[str, Recorded]]:
-        found = self._search("tags.role = 'run'", list(experiments)) if experiments else []
+        query = f"tags.role = 'run' and tags.{ARM} IS NOT NULL"
+        found = self._search(query, list(experiments)) if experiments else []
         return [(run.info.experiment_id, _recorded(run.info.run_id, run.info.status, run.data.tags)) for run in found]
 
     def _listed_sqlite(self, experiments: Sequence[str]) -> list[tuple[str, Recorded]]:
@@ -244,7 +249,9 @@ class MlflowTracker:
             for experiment, ref, status, key, value in database.execute(query, list(experiments)).fetchall():
                 runs.setdefault((str(experiment), ref, status), {})[key] = value
         return [
-            (e, _recorded(ref, status, tags)) for (e, ref, status), tags in runs.items() if tags.get("role") == "run"
+            (experiment, _recorded(ref, status, tags))
+            for (experiment, ref, status), tags in runs.items()
+            if tags.get("role") == "run" and ARM in tags
         ]
 
     def mark(self, ref: str, *, stale: bool) -> None:
@@ -287,7 +294,7 @@ class MlflowTracker:
             | {
                 "role": "run",
                 "mlflow.parentRunId": self.parent or "",
-                "variant": card.arm,
+                ARM: card.arm,
                 "algorithm": card.algorithm,
                 "task": card.task,
                 "seed": str(card.seed),
@@ -614,7 +621,7 @@ def _recorded(ref: str, status: str, tags: Mapping[str, str]) -> Recorded:
     stale, host = views.STALE in tags, Host(known["machine"], known["versions"])
     modules: Mapping[str, str] = json.loads(known[MODULES] or "{}")
     return Recorded(
-        *(ref, known["variant"], key, FROM_MLFLOW[status], known["commit"], stale, host, known["error"]),
+        *(ref, known[ARM], key, FROM_MLFLOW[status], known["commit"], stale, host, known["error"]),
         *(VALUES_ONLY in tags, modules, known[ADOPTED]),
     )
 

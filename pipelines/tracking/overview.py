@@ -212,7 +212,7 @@ def _drawn(study: StudyCard, runs: Sequence[Run]) -> "Figure":
 
     sheet = Figure(figsize=(8, 4.5), layout="constrained")
     FigureCanvasAgg(sheet)
-    axes = sheet.add_subplot(xlabel="environment steps", ylabel="return of the evaluation bank")
+    axes = sheet.add_subplot(xlabel="environment steps", ylabel="return in evaluation episodes")
     axes.set_prop_cycle(color=[legend.colour(place) for place in range(MOST)])
     curves = {arm: found for arm, mine in by_arm(runs).items() if (found := _common(mine))}
     lines, names = [], []  # named in the legend by hand: of itself it leaves out what begins with `_`

@@ -73,7 +73,7 @@ def views(params: Params, legends: Sequence[str] = ()) -> list[View]:
         legends: of its arms, which the table shows as a line each. Without them runs are grouped by their arms' names.
     """
     legends = legends[:SHOWN]
-    base, tag = _base(params, legends), legend.TAG if legends else "variant"
+    base, tag = _base(params, legends), legend.TAG if legends else "arm"
     grouped = base | {
         "groupBy": {"aggregateFunction": "average", "groupByKeys": [{"mode": "tag", "groupByData": tag}]},
         "groupsExpanded": {legend.group(name): False for name in legends},

@@ -34,6 +34,7 @@ FORMS: Mapping[str, tuple[str, ...]] = {
     MOVED: PLAYED,
 }
 
+VERSION = (b"rhmc.tables", b"2")  # in the metadata of a table of runs
 WHOLE = ("seed", "step", "agents", "targets", "trained_agents", "trained_targets")  # columns of integers from 0
 NUMBERS = ("value", "seconds")  # columns of numbers; an empty cell is NaN. All others hold words
 UNKNOWN = ("fingerprint", "question", "commit", *TOLD)  # words that may not be known
@@ -51,10 +52,22 @@ def part(path: Path) -> str:
 def earlier(path: Path) -> bool:
     """Whether a table of runs has the form in which they still told how and where they were made."""
     try:
-        names = pq.read_schema(pa.BufferReader(content(path))).names if part(path) == "runs" else []
+        names = _schema(path).names if part(path) == "runs" else []
     except (OSError, ValueError, pa.ArrowException):
         return False  # `read` says what is wrong with it
     return not set(OWN).isdisjoint(names)
+
+
+def older(path: Path) -> bool:
+    """Whether a table of runs was exported by an older version, with that version's names of studies and settings."""
+    try:
+        return part(path) == "runs" and VERSION not in (_schema(path).metadata or {}).items()
+    except (OSError, ValueError, pa.ArrowException):
+        return False  # `read` says what is wrong with it
+
+
+def _schema(path: Path) -> pa.Schema:
+    return pq.read_schema(pa.BufferReader(content(path)))
 
 
 def read(path: Path, faults: list[str]) -> pd.DataFrame:

@@ -32,6 +32,7 @@ from reports.data.exported import (
     TOLD,
     config_fault,
     earlier,
+    older,
     part,
     read,
 )
@@ -44,9 +45,10 @@ EPISODES = "episode_*.gif"  # animations, one a task
 YARDSTICKS, THEOREM = "yardsticks", "theorem"  # tables that are no studies
 ASSIGN = "assign/"  # prefix of its metrics
 FINAL, CURVE = "final/return", "eval/return"
-ERRORS = ("final/return_sem", "final/coverage_sem")  # of a scripted policy; one of both is there
+ERRORS = ("final/return_sem", "final/coverage_sem")  # of a yardstick; one of both is there
 CHECKED = ("final/", "eval/", "theorem/", ASSIGN)  # metrics that are shown: they must be finite
 REMEDY = "`rhmc export` and `rhmc yardsticks all` write them anew, and how runs were made to *.made.parquet"
+OLDER = "made by an older version and set aside, until `rhmc study run` and `rhmc export` make them anew"
 SHOWN = 5  # faults of one kind that are spelled out
 
 # The order of arms everywhere; others follow by name.
@@ -83,6 +85,7 @@ class Results:
         scenes: what Figures 4, 5 and 8 show.
         moved: trained policies with other numbers of agents and targets: columns `PLAYED`.
         notes: what was left out of the tables, in sentences.
+        older: studies whose tables an older version exported.
         episodes: an animation of an episode by task, as a GIF.
     """
 
@@ -94,7 +97,13 @@ class Results:
     scenes: Scenes | None = None
     moved: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=list(PLAYED)))
     notes: tuple[str, ...] = ()
+    older: tuple[str, ...] = ()
     episodes: Mapping[str, bytes] = field(default_factory=dict)
+
+    @property
+    def set_aside(self) -> str:
+        """A sentence on tables of an older version; empty without any."""
+        return f"Tables of {', '.join(self.older)}: {OLDER}." if self.older else ""
 
     @property
     def studies(self) -> list[str]:
@@ -188,7 +197,7 @@ class Results:
 
     @cached_property
     def yardsticks(self) -> list[tuple[dict[str, Any], pd.DataFrame]]:
-        """Per task: its configuration, and one row per scripted policy (index) with a column per metric."""
+        """Per task: its configuration, and one row per yardstick (index) with a column per metric."""
         found: dict[str, set[str]] = {}
         for row in self.runs[self.runs["study"] == YARDSTICKS].itertuples():
             key = json.dumps(_config(str(row.config)).get("env", {}), sort_keys=True)
@@ -201,7 +210,7 @@ class Results:
         return out
 
     def yardsticks_of(self, study: str) -> pd.DataFrame:
-        """Scripted policies on a study's task, however agents observe it; empty if none were run."""
+        """Yardsticks on a study's task, however agents observe it; empty if none were run."""
         return self.yardsticks_on(self.env(study))
 
     def yardsticks_on(self, env: Mapping[str, Any]) -> pd.DataFrame:
@@ -234,7 +243,7 @@ class Results:
         if absent:
             yield f"Study `{study}`: no such arm yet: {markdown(', '.join(absent))}."
         if self.yardsticks_of(study).empty:
-            yield f"Study `{study}`: no scripted policies were run on this task."
+            yield f"Study `{study}`: no yardsticks were run on this task."
 
     def _trainer(self, study: str, name: str) -> int | None:
         found = [_config(text).get("trainer", {}).get(name) for text in self.plan(study)["config"]]
@@ -298,7 +307,8 @@ def load(folder: Path, profile: str, only: str | None = None) -> Results:
         points = _join([joined["points"], watched], POINTS)
         gifs = {path.stem.partition("_")[2]: _animation(path) for path in sorted(folder.glob(EPISODES))}
         runs = _with_made(joined["runs"], joined[MADE])
-        results = Results(points, runs, profile, moved=moved, notes=notes)
+        aside = tuple(path.name.partition(".")[0] for path in files if older(path))
+        results = Results(points, runs, profile, moved=moved, notes=notes, older=aside)
         if only is None:
             methods, modules, scenes = drawn
             results = replace(results, methods=methods, modules=modules, scenes=scenes, episodes=gifs)

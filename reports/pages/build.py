@@ -34,12 +34,12 @@ MADE = ("figures", TABLES, MEASURED, "claims.md", "claims.csv", "claims.json", "
 DEFINITIONS = (
     (
         "Final return",
-        "mean over seeds of final/return, the greedy policy after the last step on a bank of {episodes} that no curve "
+        "mean over seeds of final/return, the greedy policy after the last step in {episodes} that no curve "
         "uses. Coverage: 100 × mean reward per step; navigation: sum over an episode.",
     ),
     (
         "Curve",
-        "mean over seeds of eval/return, the greedy policy on a smaller fixed bank, on one grid of steps. Faint where "
+        "mean over seeds of eval/return, the greedy policy in fewer fixed episodes, on one grid of steps. Faint where "
         "fewer seeds have come so far.",
     ),
     (
@@ -91,6 +91,7 @@ class Built(NamedTuple):
 
     files: list[Path]
     undrawn: list[str]
+    note: str = ""  # on tables of an older version
 
 
 def build(runs: Path, out: Path, profile: str, study: str | None = None) -> Built:
@@ -121,7 +122,7 @@ def build(runs: Path, out: Path, profile: str, study: str | None = None) -> Buil
     except OSError as error:
         raise OutError(f"{error.filename or out}: cannot be written ({error.strerror or error})") from error
     files = sorted(path for name in names for path in [out / name, *(out / name).rglob("*")] if path.is_file())
-    return Built(files, _undrawn(written))
+    return Built(files, _undrawn(written), results.set_aside)
 
 
 @contextmanager
@@ -165,7 +166,7 @@ def main(argv: Sequence[str] | None = None, shown: Callable[[str], str] = str) -
     except (TableError, PaperError, OutError) as error:
         print(shown(str(error)), file=sys.stderr)
         return BAD
-    for line in built.undrawn:
+    for line in [*built.undrawn, *([f"note: {built.note}"] if built.note else [])]:
         print(shown(line), file=sys.stderr)
     print(shown(f"{len(built.files)} files; start with {out / 'index.html'}"))
     return UNDRAWN if built.undrawn else DONE
@@ -192,7 +193,7 @@ def _single(results: Results, paper: Paper, study: str) -> Report:
 
 
 def definitions(results: Results) -> list[tuple[str, str]]:
-    """What the words mean, with the size of the final bank."""
+    """The meaning of the words, with the number of final evaluation episodes."""
     counts = sorted({n for study in results.studies if (n := results.final_episodes(study))})
     episodes = f"{' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))} episodes" if counts else "episodes"
     return [(name, words.replace("{episodes}", episodes)) for name, words in DEFINITIONS]
@@ -294,6 +295,8 @@ def _index(report: Report) -> Iterator[str]:
     results = report.results
     yield f"# {markdown(report.title)}\n"
     yield "The same with everything in one page: `index.html`.\n"
+    if results.set_aside:
+        yield f"**{results.set_aside}**\n"
     yield f"{_summary(results)}\n"
     if report.short:
         yield "\n".join(f"- {markdown(line)}" for line in report.short) + "\n"
@@ -348,6 +351,7 @@ def _content(report: Report, pictures: Path) -> Mapping[str, Any]:
     return {
         "title": report.title,
         "lead": report.lead,
+        "aside": words(results.set_aside),
         "short": report.short,
         "folded": page.FOLDED,
         "tally": page.verdicts(report.claims),
@@ -359,7 +363,7 @@ def _content(report: Report, pictures: Path) -> Mapping[str, Any]:
         "provenance": page.provenance(results),
         "made": page.grid("provenance", report.tables["provenance"]),
         "runs": page.grid("runs", runs),
-        "counted": "runs" if set(results.runs["study"]) <= set(results.studies) else "runs, with scripted policies",
+        "counted": "runs" if set(results.runs["study"]) <= set(results.studies) else "runs, with yardsticks",
         "ids": [f"run-{stem(run)}" if first else "" for run, first in _first_seen(runs)],
         "foot": f"Built from the exported tables of profile {results.profile}; the same tables give the same page.",
     }
@@ -387,9 +391,7 @@ def _sections(report: Report, pictures: Path) -> list[page.Section]:
         for names in [tuple(name for name, owner in of_table.items() if owner == study)]
     ]
     rest = tuple(name for name in report.tables if name not in of_table and name not in ("table_1", *LAST))
-    whole.append(
-        _section(report, pictures, "scale", "Scripted policies, bounds, transfer, encoder, Theorem 1", "-", rest)
-    )
+    whole.append(_section(report, pictures, "scale", "Yardsticks, transfer, encoder, Theorem 1", "-", rest))
     return [section for section in whole if section.plates or section.grids]
 
 

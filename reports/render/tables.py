@@ -167,7 +167,7 @@ def steadiness(results: Results, study: str) -> Table:
 
 
 def yardsticks(results: Results) -> Table:
-    """Scripted policies and bounds of every task: mean, standard error in brackets."""
+    """Yardsticks of every task: mean, standard error in brackets."""
     numbers, shown = [], []
     for task, table in results.yardsticks:
         names = [name for name in table.columns if not name.endswith("_sem")]
@@ -175,7 +175,7 @@ def yardsticks(results: Results) -> Table:
             numbers.append({"task": describe_task(task), "policy": row["arm"]} | {k: row[k] for k in table.columns})
             cells = {_title(name): _with_error(row[name], row.get(f"{name}_sem", np.nan)) for name in names}
             shown.append({"Task": describe_task(task), "Policy": readable(str(row["arm"]))} | cells)
-    return Table("Scripted policies and bounds", pd.DataFrame(numbers), pd.DataFrame(shown).fillna(NONE))
+    return Table("Yardsticks", pd.DataFrame(numbers), pd.DataFrame(shown).fillna(NONE))
 
 
 def theorem(results: Results) -> Table | None:

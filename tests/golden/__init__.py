@@ -19,8 +19,8 @@ from pipelines.tracking.plan import items, study_card
 from pipelines.tracking.tracker import MemoryTracker
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import ENVS
-from rhmc.scripted.yardsticks import yardsticks
 from rhmc.training.trainer import Trainer
+from rhmc.yardsticks.scores import play_yardsticks
 from tests.pipelines.support import tiny
 
 FILE = Path(__file__).with_name("digests.json")
@@ -83,7 +83,7 @@ def _training(task: str, algo: dict[str, Any], **env: Any) -> Callable[[], str]:
 
 
 def _yardsticks(task: str) -> Callable[[], str]:
-    return lambda: digest(yardsticks(ENVS[task].config(), episodes=4, seed=1))
+    return lambda: digest(play_yardsticks(ENVS[task].config(), episodes=4, seed=1))
 
 
 def _table() -> str:

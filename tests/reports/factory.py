@@ -8,12 +8,15 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 
+from pipelines.export.tables import RUNS as RUNS_OF_NOW
 from reports.data.frame import METHOD, METHODS, OWN, PLACE, POINTS, RUNS
 
 COVERAGE = {"kind": "coverage", "preset": "flat", "agents": 4, "targets": 5, "observation": "extended"}
 NAVIGATION = {"kind": "navigation", "agents": 3, "reward": "paper"}
-SCRIPTED = {
+YARDSTICK_RETURNS = {
     "random": 30.4,
     "nearest": 60.6,
     "best_window": 65.3,
@@ -68,9 +71,9 @@ def study(
 
 
 def yardsticks(
-    values: Mapping[str, float] = SCRIPTED, env: Mapping[str, Any] = COVERAGE, profile: str = "quick"
+    values: Mapping[str, float] = YARDSTICK_RETURNS, env: Mapping[str, Any] = COVERAGE, profile: str = "quick"
 ) -> Tables:
-    """Scripted policies, standard error 0.3."""
+    """Yardsticks, standard error 0.3."""
     points, runs = study("yardsticks", {name: [value] for name, value in values.items()}, env=env, profile=profile)
     points = points[points["metric"].str.startswith("final/")].assign(step=0)
     errors = points.assign(metric=points["metric"] + "_sem", value=0.3)
@@ -126,7 +129,8 @@ def write(folder: Path, *tables: Tables) -> Path:
             own = [column for column in OWN if column in runs]
             made = runs[[*PLACE, *own]].reindex(columns=[*PLACE, *OWN], fill_value="")
             made.to_parquet(folder / f"{name}.made.parquet", index=False)
-            runs.drop(columns=own).to_parquet(folder / f"{name}.runs.parquet", index=False)
+            table = pa.Table.from_pandas(runs.drop(columns=own), preserve_index=False)
+            pq.write_table(table.replace_schema_metadata(RUNS_OF_NOW.metadata), folder / f"{name}.runs.parquet")
     return folder
 
 

@@ -251,7 +251,7 @@ def test_no_two_names_share_a_file(names: list[str]) -> None:
 
 
 def test_plain_names_are_their_own_stems() -> None:
-    for name in ("coverage_letter", "reach@hard", "7e67c370d8f2"):
+    for name in ("coverage_paper_faithful", "reach@hard", "7e67c370d8f2"):
         assert escape.stem(name) == name
     assert escape.stem("reach_arms") != "reach_arms"  # which are the files of the study `reach`
 

@@ -91,7 +91,7 @@ def logged(card: StudyCard, home: Path) -> list[Run]:
 
 def _run(client: Any, one: Any, home: Path) -> Run:
     tags, ref = one.data.tags, one.info.run_id
-    name = "/".join(tags.get(key, "") for key in ("role", "variant", "seed", "spec"))
+    name = "/".join(tags.get(key, "") for key in ("role", "arm", "seed", "spec"))
     history = {}
     for metric in sorted(one.data.metrics):
         values = [

@@ -146,15 +146,15 @@ def in_registration(fuse: Fuse) -> None:
 
 def asked(fuse: Fuse, *, between: bool) -> None:
     """Arm the fuse while a trial is asked for and not told, or while none is."""
-    ledgers: list[trials.Ledger] = []
-    make = trials.Ledger.__init__
+    arm_studies: list[trials.ArmStudy] = []
+    make = trials.ArmStudy.__init__
 
-    def noted(self: trials.Ledger, *args: Any) -> None:
+    def noted(self: trials.ArmStudy, *args: Any) -> None:
         make(self, *args)
-        ledgers.append(self)
+        arm_studies.append(self)
 
-    trials.Ledger.__init__ = noted  # type: ignore[method-assign]
-    fuse.counts = lambda: between == any(one.live for one in ledgers)
+    trials.ArmStudy.__init__ = noted  # type: ignore[method-assign]
+    fuse.counts = lambda: between == any(one.live for one in arm_studies)
 
 
 def asked_for(fuse: Fuse) -> None:

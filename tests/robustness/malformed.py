@@ -311,7 +311,7 @@ def options() -> Iterator[Case]:
         ("an arm", "evaluate s.yaml --arm none", "--arm", "IQL"),
         ("a seed of 2^64", "evaluate s.yaml --seed 18446744073709551616", "seed"),
         ("episodes 10^18", "evaluate s.yaml --episodes 1000000000000000000", "episodes"),
-        ("a bank of 2^64", "evaluate s.yaml --bank 18446744073709551616", "bank"),
+        ("an eval seed of 2^64", "evaluate s.yaml --eval-seed 18446744073709551616", "eval-seed"),
         ("transfer to x", "transfer s.yaml --agents x --out o", "--agents"),
         ("transfer to 10^30", f"transfer s.yaml --agents {10**30} --out o", "--agents"),
         ("a port", "ui --port 70000", "port"),

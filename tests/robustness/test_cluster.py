@@ -418,10 +418,10 @@ def test_a_search_in_postgresql_is_killed_and_goes_on_with_more_trials(
         wait_for(lambda: launched.said() and list(tmp_path.glob("checkpoints/*/0*.pt")), "a trial under way")
     more = Search.load("search_x.yaml", overrides=["trials=3"])
     assert show_search(more, tmp_path) == 1
-    with driver([*command, "--set", "trials=3", "--out", "found"], at_site, tmp_path) as launched:
+    with driver([*command, "--set", "trials=3", "--out", "best_params"], at_site, tmp_path) as launched:
         out = launched.end()
     assert "IQL: 0 of 3 trials are done, 1 are taken up" in out
-    assert (tmp_path / "found" / "search_x.iql.quick.yaml").exists()
+    assert (tmp_path / "best_params" / "search_x.iql.quick.yaml").exists()
     assert not (tmp_path / "optuna.db").exists()
     assert show_search(more, tmp_path) == 0
     tracker = open_existing(search_card(more), Home(tmp_path))

@@ -162,7 +162,7 @@ def test_there_is_what_was_here(here: Path, there: Path, tmp_path: Path, name: s
     policy = tracker.file(runs["slow"].ref, "policy.pt", tmp_path)
     assert policy is not None
     assert load(policy).spec == slow.spec
-    assert {made.tags["variant"] for made in tracker.client.search_model_versions()} == {"slow", "fast"}
+    assert {made.tags["arm"] for made in tracker.client.search_model_versions()} == {"slow", "fast"}
     assert [row.value for row in tracker.rows([runs["slow"].ref]) if row.metric == "time/seconds"] == [0, 1, 2, 3]
     for point in (1, 2):
         files = [Home(home).checkpoints(late.key) / f"{point:08d}.pt" for home in (here, there)]
@@ -251,9 +251,9 @@ def test_a_run_that_another_process_trains_is_left_alone_and_nothing_is_written(
 
 
 def test_a_variant_travels_under_its_own_name(here: Path, there: Path, tmp_path: Path) -> None:
-    variant: Study = STUDY.model_copy(update={"name": "tiny@letter"})
+    variant: Study = STUDY.model_copy(update={"name": "tiny@paper_faithful"})
     assert pack(variant, tmp_path / "b.zip", here)[:3] == (4, 0, 1)
-    assert unpack(tmp_path / "b.zip", there).study == "tiny@letter"
+    assert unpack(tmp_path / "b.zip", there).study == "tiny@paper_faithful"
 
 
 # What the study is then

@@ -715,8 +715,8 @@ def test_a_setting_that_one_method_lacks_does_not_vary_for_that() -> None:
 
 
 def test_the_next_command_names_the_variant() -> None:
-    study = Study.load(STUDIES / "ablation.yaml", "quick", ["seeds=1"], "letter")
-    assert _arguments([study]) == f"{STUDIES / 'ablation.yaml'} --profile quick --variant letter --set seeds=1"
+    study = Study.load(STUDIES / "ablation.yaml", "quick", ["seeds=1"], "paper_faithful")
+    assert _arguments([study]) == f"{STUDIES / 'ablation.yaml'} --profile quick --variant paper_faithful --set seeds=1"
 
 
 def test_the_next_command_names_the_file_and_the_changes() -> None:

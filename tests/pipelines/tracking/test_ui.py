@@ -181,7 +181,7 @@ def test_every_arm_has_a_colour_of_its_own_and_reads_as_before() -> None:
 def looks(tracker: MlflowTracker) -> dict[str, tuple[str, str]]:
     """Legend and colour of the runs, by arm."""
     tags = [run.data.tags for run in tracker._search("tags.role = 'run'")]
-    return {one["variant"]: (one["legend"], one.get("mlflow.runColor", "")) for one in tags}
+    return {one["arm"]: (one["legend"], one.get("mlflow.runColor", "")) for one in tags}
 
 
 def test_an_arm_keeps_its_colour_when_the_study_is_extended(home: Path) -> None:
@@ -197,14 +197,6 @@ def test_an_arm_keeps_its_colour_when_the_study_is_extended(home: Path) -> None:
     tracker = MlflowTracker(STUDY._replace(arms=["new", "fast", "slow"]), Home(home))
     tracker.start(CARD._replace(arm="new", spec_id="new"))
     assert looks(tracker) == first | {"new": (legend.legend("new", 2), legend.colour(2))}
-
-
-def test_runs_of_an_earlier_version_are_coloured_by_the_next_launch(home: Path) -> None:
-    tracker = MlflowTracker(STUDY, Home(home))
-    ref = tracker.start(CARD._replace(arm="fast")).ref
-    for tag in ("legend", "mlflow.runColor"):
-        tracker.client.delete_tag(ref, tag)
-    assert looks(MlflowTracker(STUDY, Home(home))) == {"fast": (legend.legend("fast", 1), legend.colour(1))}
 
 
 @pytest.mark.parametrize("view", views.views({"iql": ["seed"]}), ids=lambda view: view.key)
@@ -246,7 +238,7 @@ def test_a_study_that_was_logged_without_views_gets_them_when_it_is_shown(home: 
     state = unpacked(tags["mlflow.sharedViewState.rhmc-parallel"])
     assert sorted(state["compareRunCharts"][0]["selectedParams"]) == ["algo.lr", "method", "seed"]
     finals = unpacked(tags["mlflow.sharedViewState.rhmc-finals"])
-    assert finals["groupBy"]["groupByKeys"] == [{"mode": "tag", "groupByData": "variant"}]
+    assert finals["groupBy"]["groupByKeys"] == [{"mode": "tag", "groupByData": "arm"}]
 
 
 def test_views_pass_over_stale_runs_and_the_parent(home: Path) -> None:

@@ -24,7 +24,7 @@ from pipelines.tracking.mlflow_tracker import MlflowTracker, fetch, open_existin
 from pipelines.tracking.plan import items, study_card
 from pipelines.tracking.policy import FILE, Saved, load, save
 from pipelines.tuning.search_run import show_search
-from pipelines.tuning.trials import Ledger, look, open_storage, opened
+from pipelines.tuning.trials import ArmStudy, look, open_storage, opened
 from pipelines.workspace import relocation as moved
 from pipelines.workspace import sqlite
 from pipelines.workspace.errors import InputError
@@ -326,7 +326,7 @@ def searched(home: Path) -> Search:
     search = Search.load(home.parent / "search_x.yaml", "quick", [])
     with opened(Home(home)) as storage:
         assert storage is not None
-        assert Ledger(search, "one", storage).ask() is not None
+        assert ArmStudy(search, "one", storage).ask() is not None
     return search
 
 

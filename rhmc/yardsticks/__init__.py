@@ -1,16 +1,16 @@
-"""Policies without learning and bounds, by task and name, as the scale of learned scores; nothing learns here."""
+"""Yardsticks of learned scores: policies without learning and bounds, by task and name; nothing learns here."""
 
 from collections.abc import Callable
 from typing import Any
 
 from torch import Generator, Tensor
 
-from rhmc.scripted import coverage, navigation
+from rhmc.yardsticks import coverage, navigation
 
 Policy = Callable[[Any, Any, Generator], Tensor]  # configuration, state, generator -> actions
 Bound = Callable[[Any, Any], Tensor]  # configuration, state -> (B,) score of the present step
 
-SCRIPTED: dict[str, dict[str, Policy]] = {
+POLICIES: dict[str, dict[str, Policy]] = {
     "coverage": {
         "random": coverage.random,
         "hold": coverage.hold,

@@ -4,7 +4,7 @@ import torch
 from torch import Generator, Tensor
 
 from rhmc.envs.navigation import DIRECTIONS, DT, FORCE, KEPT, Config, State
-from rhmc.scripted.joint import best_choice
+from rhmc.yardsticks.joint import best_choice
 
 
 def random(cfg: Config, state: State, rng: Generator) -> Tensor:

@@ -1,4 +1,4 @@
-"""Scripted policies and bounds: against slow searches on small instances, and against each other on a common bank."""
+"""Yardsticks: against slow searches on small instances, and against each other in the same episodes."""
 
 import itertools
 import math
@@ -13,16 +13,15 @@ from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from rhmc.envs import coverage, make_env, navigation
-from rhmc.scripted import BOUNDS, SCRIPTED, joint
-from rhmc.scripted import coverage as sensors
-from rhmc.scripted import navigation as steering
-from rhmc.scripted import yardsticks as module
-from rhmc.scripted.yardsticks import yardsticks
+from rhmc.yardsticks import BOUNDS, POLICIES, joint, scores
+from rhmc.yardsticks import coverage as sensors
+from rhmc.yardsticks import navigation as steering
+from rhmc.yardsticks.scores import play_yardsticks
 from tests.oracles import coverage as oracle
 
 quick = settings(deadline=None, max_examples=25)
 seeds = st.integers(0, 2**31)
-COVERAGE = SCRIPTED["coverage"]
+COVERAGE = POLICIES["coverage"]
 FLAT = {  # mean coverage in %, 4 sensors and 5 targets
     "random": 32.1,
     "hold": 32.0,
@@ -316,25 +315,25 @@ def test_steering_takes_the_force_that_coasts_nearest(seed: int, order: Any) -> 
 
 
 @pytest.mark.parametrize("continuous", [False, True])
-@pytest.mark.parametrize("name", sorted(SCRIPTED["navigation"]))
+@pytest.mark.parametrize("name", sorted(POLICIES["navigation"]))
 def test_a_policy_steers_any_number_of_agents(name: str, continuous: bool) -> None:
     for n in range(1, 7):
         cfg = navigation.Config(agents=n, continuous=continuous)
         env = make_env(cfg, 3, generator(n))
         env.reset()
-        action = SCRIPTED["navigation"][name](cfg, env.state, generator(0))
+        action = POLICIES["navigation"][name](cfg, env.state, generator(0))
         assert action.shape == ((3, n, 2) if continuous else (3, n))
         assert action.is_floating_point() is continuous
         assert action.abs().max() <= (1 if continuous else 4)
         env.step(action)
 
 
-# --- on a common bank ------------------------------------------------------------------------------------------------
+# --- in the same episodes --------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def flat() -> dict[str, dict[str, float]]:
-    return yardsticks(coverage.Config(), episodes=400)
+    return play_yardsticks(coverage.Config(), episodes=400)
 
 
 def test_flat_coverage_has_the_known_levels(flat: dict[str, dict[str, float]]) -> None:
@@ -357,20 +356,22 @@ def test_yardsticks_are_in_order(flat: dict[str, dict[str, float]]) -> None:
 
 
 def test_planning_ahead_beats_seeking_the_best_window() -> None:
-    level = yardsticks(coverage.Config(), ["best_window", "planner", "free_heading_bound"], episodes=16, seed=1)
+    level = play_yardsticks(coverage.Config(), ["best_window", "planner", "free_heading_bound"], episodes=16, seed=1)
     assert level["best_window"]["coverage"] + 3 < level["planner"]["coverage"]
     assert level["planner"]["coverage"] + 4 < level["free_heading_bound"]["coverage"]
 
 
 def test_more_sensors_see_more() -> None:
-    levels = [yardsticks(coverage.Config(agents=n), ["best_window", "range_bound"], episodes=100) for n in (1, 2, 4, 6)]
+    levels = [
+        play_yardsticks(coverage.Config(agents=n), ["best_window", "range_bound"], episodes=100) for n in (1, 2, 4, 6)
+    ]
     for name in ("best_window", "range_bound"):
         series = [level[name]["coverage"] for level in levels]
         assert all(a + 2 < b for a, b in itertools.pairwise(series))
 
 
 def test_executor_has_a_local_return_and_bounds_have_none() -> None:
-    level = yardsticks(coverage.Config(preset="executor"), ["best_window", "range_bound"], episodes=100)
+    level = play_yardsticks(coverage.Config(preset="executor"), ["best_window", "range_bound"], episodes=100)
     assert level["best_window"]["coverage"] == pytest.approx(72.3, abs=3)
     assert level["range_bound"]["coverage"] == pytest.approx(92.3, abs=3)
     assert -70 < level["best_window"]["return"] < -40
@@ -379,7 +380,7 @@ def test_executor_has_a_local_return_and_bounds_have_none() -> None:
 
 @pytest.mark.parametrize(("reward", "column"), [("mpe2", 0), ("paper", 1)])
 def test_navigation_has_the_known_levels(reward: Any, column: int) -> None:
-    level = yardsticks(navigation.Config(reward=reward))
+    level = play_yardsticks(navigation.Config(reward=reward))
     assert list(level) == list(NAVIGATION)
     for name, score in level.items():
         assert abs(score["return"] - NAVIGATION[name][column]) < 4 * score["sem"], name
@@ -387,17 +388,17 @@ def test_navigation_has_the_known_levels(reward: Any, column: int) -> None:
     assert level["matching"]["collisions"] < level["nearest"]["collisions"]
 
 
-def test_the_bank_depends_on_the_seed_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "CHUNK", 4)
+def test_the_episodes_depend_on_the_seed_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scores, "CHUNK", 4)
     cfg = navigation.Config()
-    both = yardsticks(cfg, ["random", "nearest"], episodes=10, seed=3)
-    assert yardsticks(cfg, ["nearest"], episodes=10, seed=3)["nearest"] == both["nearest"]
-    assert yardsticks(cfg, ["nearest"], episodes=10, seed=4)["nearest"] != both["nearest"]
+    both = play_yardsticks(cfg, ["random", "nearest"], episodes=10, seed=3)
+    assert play_yardsticks(cfg, ["nearest"], episodes=10, seed=3)["nearest"] == both["nearest"]
+    assert play_yardsticks(cfg, ["nearest"], episodes=10, seed=4)["nearest"] != both["nearest"]
 
 
 def test_numbers_are_means_over_whole_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
     """The score of `hold` in three chunks, recomputed with the environment itself."""
-    monkeypatch.setattr(module, "CHUNK", 4)
+    monkeypatch.setattr(scores, "CHUNK", 4)
     cfg, rng = coverage.Config(), generator(3)
     cover, reward = [], []
     for batch in (4, 4, 2):
@@ -412,7 +413,7 @@ def test_numbers_are_means_over_whole_episodes(monkeypatch: pytest.MonkeyPatch) 
         cover.append(out.info["coverage"])
         reward.append(out.reward)
     episodes = torch.cat([torch.stack(cover[s : s + 100]).mean(0) for s in (0, 100, 200)]) * 100
-    score = yardsticks(cfg, ["hold"], episodes=10, seed=3)["hold"]
+    score = play_yardsticks(cfg, ["hold"], episodes=10, seed=3)["hold"]
     assert score["coverage"] == pytest.approx(float(episodes.mean()), abs=1e-4)
     assert score["sem"] == pytest.approx(float(episodes.std()) / 10**0.5, abs=1e-4)
     assert score["return"] == pytest.approx(float(torch.cat(reward).mean()) * 100, abs=1e-4)
@@ -434,6 +435,6 @@ def test_the_bounds_hold_step_by_step_for_every_policy() -> None:
 
 def test_requests_that_make_no_sense_are_refused() -> None:
     with pytest.raises(ValueError, match=r"no plannr; there are random, hold.*range_bound"):
-        yardsticks(coverage.Config(), ["plannr"])
+        play_yardsticks(coverage.Config(), ["plannr"])
     with pytest.raises(ValueError, match="at least 2"):
-        yardsticks(coverage.Config(), episodes=1)
+        play_yardsticks(coverage.Config(), episodes=1)

@@ -1,4 +1,4 @@
-"""Scores of the scripted policies and of the bounds, all on one bank of episodes."""
+"""Scores of the yardsticks of a task, policies and bounds, all on the same evaluation episodes."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -8,18 +8,18 @@ from torch import Generator, Tensor
 
 from rhmc.envs import ENVS, EnvConfig, coverage
 from rhmc.envs.base import Outcome
-from rhmc.scripted import BOUNDS, SCRIPTED
+from rhmc.yardsticks import BOUNDS, POLICIES
 
-CHUNK = 200  # episodes at once; bounds the planner's memory. Part of the bank: another value draws other episodes
+CHUNK = 200  # episodes at once; bounds the planner's memory. Another value draws other episodes
 SLOW = ("planner",)  # left out unless asked for
 
 
 def names(kind: str) -> list[str]:
     """All yardsticks of a task."""
-    return [*SCRIPTED[kind], *BOUNDS[kind]]
+    return [*POLICIES[kind], *BOUNDS[kind]]
 
 
-def yardsticks(
+def play_yardsticks(
     env_cfg: EnvConfig, policies: Sequence[str] | None = None, episodes: int = 1000, seed: int = 0
 ) -> dict[str, dict[str, float]]:
     """Score policies and bounds by name. Starts and target motion are the same for all of them.
@@ -28,7 +28,7 @@ def yardsticks(
         env_cfg: the task.
         policies: of `names(env_cfg.kind)`; all but `SLOW` if None.
         episodes: 2 or more, as a standard error is taken over them.
-        seed: of the bank; the policies' own draws have a generator of their own.
+        seed: of the episodes; the policies' own draws have a generator of their own.
 
     Returns:
         For coverage, in percent: `coverage`, its standard error `sem` over episodes, `return` (mean reward per step).
@@ -72,7 +72,7 @@ def _sem(values: Tensor) -> float:
 
 
 def _episodes(cfg: EnvConfig, name: str, episodes: int, seed: int) -> dict[str, Tensor]:
-    """Logs of a yardstick over the bank: (episodes, steps) each."""
+    """Logs of a yardstick over the episodes: (episodes, steps) each."""
     world = Generator().manual_seed(seed)
     own = Generator().manual_seed(seed)
     run = _bound if name in BOUNDS[cfg.kind] else _policy
@@ -85,7 +85,7 @@ def _episodes(cfg: EnvConfig, name: str, episodes: int, seed: int) -> dict[str, 
 
 def _policy(cfg: EnvConfig, name: str, batch: int, world: Generator, own: Generator) -> Iterator[dict[str, Tensor]]:
     """What each step of one episode per row logs."""
-    physics, act = ENVS[cfg.kind].physics, SCRIPTED[cfg.kind][name]
+    physics, act = ENVS[cfg.kind].physics, POLICIES[cfg.kind][name]
     state = physics.initial(cfg, batch, world)
     for _ in range(physics.spec(cfg).episode):
         action = act(cfg, state, own)
@@ -98,7 +98,7 @@ def _bound(cfg: EnvConfig, name: str, batch: int, world: Generator, own: Generat
     """The same for a bound: its value in each state on the way (which no action of the sensors' changes)."""
     physics, score = ENVS[cfg.kind].physics, BOUNDS[cfg.kind][name]
     state = physics.initial(cfg, batch, world)
-    hold = SCRIPTED[cfg.kind]["hold"](cfg, state, own)
+    hold = POLICIES[cfg.kind]["hold"](cfg, state, own)
     for _ in range(physics.spec(cfg).episode):
         state = physics.transition(cfg, state, hold, world)
         seen = score(cfg, state)

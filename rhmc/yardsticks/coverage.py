@@ -10,7 +10,7 @@ import torch
 from torch import Generator, Tensor
 
 from rhmc.envs.coverage import HALF_AREA, HALF_VIEW, RANGE, TURN, TURNS, Config, State, relation, visible, wrap
-from rhmc.scripted.joint import best_choice, largest_union
+from rhmc.yardsticks.joint import best_choice, largest_union
 
 HORIZON = 30  # steps the planner looks ahead
 PASSES = 2  # rounds in which each sensor's plan is improved, the others' held fixed
