@@ -246,7 +246,7 @@ def _take_in(told: Told, study: StudyCard, home: Home, stock: Stock) -> Taken:
                 _log(tracker, study, entry, stock, told.about.adopted.get(entry.key, ""))
             for entry in begun:
                 _lay_out(tracker, there.get(entry.place), home, entry, stock)
-            complete = told.plan is not None and told.plan <= finished(tracker.recorded())
+            complete = told.plan <= finished(tracker.recorded())
         finally:
             tracker.close("finished" if complete else "interrupted")
     here = present()

@@ -68,8 +68,8 @@ MODULES = "modules"  # tag of a run: the digests of its code as JSON
 TRACE = "error.txt"  # a run's file with why it failed
 ARM = "arm"  # tag of a run; a run without it was logged by an older version
 OLDER = (
-    "{} runs of an older version (no tag 'arm') in the log are set aside; `rhmc study run` trains the study anew, "
-    "the version that logged them reads them"
+    "the log holds runs of an older version (without the tag 'arm'), which are set aside: {}; `rhmc study run` trains "
+    "them anew"
 )
 ARMS = "arms"  # the experiment's tag with its arms as JSON, in the order in which they came: it decides their colours
 COLOURED = 100  # arms that the tag has room for; a view shows no more

@@ -203,13 +203,14 @@ def test_runs_of_an_older_version_are_set_aside(home: Path, lister: str, monkeyp
     old = tracker.start(CARD)
     tracker.client.set_tag(old.ref, "variant", CARD.arm)
     tracker.client.delete_tag(old.ref, "arm")
-    tracker.start(CARD._replace(spec_id="other")).finish("finished")
+    for name in ("other", "third"):
+        tracker.start(CARD._replace(spec_id=name)).finish("finished")
     monkeypatch.setattr(MlflowTracker, "_listed_sqlite", getattr(MlflowTracker, lister))
     for again in (MlflowTracker(STUDY, Home(home)), open_existing(STUDY, Home(home))):
         assert again is not None
-        assert [run.key for run in again.recorded()] == ["other-c0de"]
+        assert [run.key for run in again.recorded()] == ["other-c0de", "third-c0de"]
         assert [remark.partition("; ")[0] for remark in again.remarks] == [
-            "1 runs of an older version (no tag 'arm') in the log are set aside"
+            "the log holds runs of an older version (without the tag 'arm'), which are set aside: 1"
         ]
     assert MlflowTracker(STUDY, Home(home)).start(CARD).ref != old.ref
 
