@@ -1,6 +1,5 @@
 """What every method of the table must do, on both encoders and both tasks; and RHMC in its variants."""
 
-import io
 from functools import cache
 from itertools import product
 from typing import Any, NamedTuple
@@ -20,6 +19,7 @@ from rhmc.training.trainer import Config, Trainer
 from rhmc.types import Batch, Obs, Transition
 from tests import toy
 from tests.conformance import DifferentError, assert_same
+from tests.support import seeded, through_a_file
 
 EPISODE = 7  # of both tasks here, so that runs of a few steps cross its end
 SMALL = {
@@ -111,14 +111,6 @@ def _short_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def trainer(case: Case, seed: int = 0) -> Trainer:
     return Trainer(case.env, case.algo, RUN, seed)
-
-
-def through_a_file(state: Any) -> Any:
-    """What a checkpoint is after it was written and read, by the reader that runs no code."""
-    file = io.BytesIO()
-    torch.save(state, file)
-    file.seek(0)
-    return torch.load(file, weights_only=True)
 
 
 # Resume
@@ -362,10 +354,6 @@ def at_random(env: Env) -> Tensor:
     if env.spec.continuous:
         return torch.rand(*shape, env.spec.actions) * 2 - 1
     return torch.randint(env.spec.actions, shape)
-
-
-def seeded(seed: int = 3) -> Generator:
-    return Generator().manual_seed(seed)
 
 
 @every

@@ -48,11 +48,6 @@ STUDIES = Path(__file__).parents[3] / "studies"
 
 
 @pytest.fixture
-def shelf() -> list[MemoryRun]:
-    return []
-
-
-@pytest.fixture
 def launch(shelf: list[MemoryRun], tmp_path: Path) -> Launch:
     """A recorder as a new launch makes it."""
 

@@ -23,11 +23,6 @@ POINTS = [
 
 
 @pytest.fixture
-def shelf() -> list[MemoryRun]:
-    return []
-
-
-@pytest.fixture
 def tracker(shelf: list[MemoryRun]) -> MemoryTracker:
     return MemoryTracker(study_card(tiny()), shelf)
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from pipelines.specs.document import Node, Place, merge, plain
 from pipelines.specs.study import PROFILES, RunSpec, Study, StudyError, changes
 from rhmc.algorithms import ALGORITHMS
+from tests.support import changing
 
 GOOD = """\
 question: Which?
@@ -25,6 +26,7 @@ arms:
 seeds: {quick: 2, paper: 3}
 steps: 1000
 """
+changed = changing(GOOD)
 ARMS = GOOD[GOOD.index("arms:") : GOOD.index("seeds:")]
 ROOT = Path(__file__).parents[3]
 
@@ -44,11 +46,6 @@ def faults(text: str, *overrides: str, profile: str = "quick") -> list[str]:
     with pytest.raises(StudyError) as caught:
         load(text, profile, *overrides)
     return str(caught.value).splitlines()
-
-
-def changed(old: str, new: str) -> str:
-    assert GOOD.count(old) == 1
-    return GOOD.replace(old, new)
 
 
 # What a study resolves to

@@ -43,6 +43,7 @@ from rhmc.training.trainer import Trainer
 from tests.pipelines.execution.test_trainable import same
 from tests.pipelines.support import CODE, interrupt, setting
 from tests.robustness.killed import PoolHere
+from tests.support import changing
 
 ROOT = Path(__file__).parents[3]
 GOOD = """\
@@ -67,6 +68,7 @@ seeds: 2
 steps: 600
 sampler: {startup: 2}
 """
+changed = changing(GOOD)
 
 
 @pytest.fixture(autouse=True)
@@ -82,11 +84,6 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def load(text: str = GOOD, profile: str = "quick", *overrides: str) -> Search:
     Path("studies/search_x.yaml").write_text(text)
     return Search.load("studies/search_x.yaml", profile, overrides)
-
-
-def changed(old: str, new: str) -> str:
-    assert GOOD.count(old) == 1
-    return GOOD.replace(old, new)
 
 
 # The file

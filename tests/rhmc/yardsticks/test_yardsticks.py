@@ -18,6 +18,7 @@ from rhmc.yardsticks import coverage as sensors
 from rhmc.yardsticks import navigation as steering
 from rhmc.yardsticks.scores import play_yardsticks
 from tests.oracles import coverage as oracle
+from tests.support import seeded
 
 quick = settings(deadline=None, max_examples=25)
 seeds = st.integers(0, 2**31)
@@ -41,13 +42,9 @@ NAVIGATION = {  # return under the `mpe2` reward, under the `paper` reward, land
 }
 
 
-def generator(seed: int) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
-
-
 def drawn(cfg: coverage.Config, batch: int, seed: int, steps: int = 10) -> coverage.State:
     """A batch some steps into its episodes."""
-    rng = generator(seed)
+    rng = seeded(seed)
     state = coverage.initial(cfg, batch, rng)
     for _ in range(steps):
         state = coverage.transition(cfg, state, torch.randint(3, (batch, cfg.agents), generator=rng), rng)
@@ -57,7 +54,7 @@ def drawn(cfg: coverage.Config, batch: int, seed: int, steps: int = 10) -> cover
 def settled(cfg: coverage.Config, state: coverage.State, policy: Any, steps: int = 60) -> coverage.State:
     """Where the policy ends while the targets stand still."""
     for _ in range(steps):
-        turn = torch.tensor(coverage.TURNS)[policy(cfg, state, generator(0))]
+        turn = torch.tensor(coverage.TURNS)[policy(cfg, state, seeded(0))]
         state = state._replace(heading=coverage.wrap(state.heading + turn), last=state.targets)
     return state
 
@@ -88,7 +85,7 @@ def union_size(sets: Iterable[frozenset[int]]) -> int:
 @given(st.integers(1, 4), st.integers(1, 4), st.integers(1, 6), seeds)
 @quick
 def test_best_choice_is_the_best_of_all_joint_choices(n: int, k: int, m: int, seed: int) -> None:
-    rng = generator(seed)
+    rng = seeded(seed)
     member = torch.rand(3, n, k, m, generator=rng) < 0.3
     cost = torch.randint(0, 4, (3, n, k), generator=rng).float()
     choice, largest = joint.best_choice(member, cost), joint.largest_union(member)
@@ -170,7 +167,7 @@ def roomy(state: coverage.State) -> coverage.State:
 def test_joint_one_step_is_the_best_of_all_joint_actions(seed: int, n: int, m: int) -> None:
     cfg = coverage.Config(agents=n, targets=m)
     state = drawn(cfg, 3, seed)
-    action = sensors.joint_one_step(cfg, state, generator(0))
+    action = sensors.joint_one_step(cfg, state, seeded(0))
     _, distance = coverage.relation(state)
     closest = distance.argmin(1)
 
@@ -204,7 +201,7 @@ def test_nearest_and_mean_all_end_turned_to_their_point(seed: int, n: int, m: in
 @given(seeds, st.integers(1, 6))
 @quick
 def test_best_path_is_the_best_of_all_walks(seed: int, times: int) -> None:
-    gain = torch.randint(0, 3, (4, times, 2 * times + 1), generator=generator(seed)).float()
+    gain = torch.randint(0, 3, (4, times, 2 * times + 1), generator=seeded(seed)).float()
     path = sensors._best_path(gain)
     assert (path.diff(dim=1, prepend=torch.full((4, 1), times)).abs() <= 1).all()
     mine = gain.gather(2, path.unsqueeze(-1)).sum((1, 2))
@@ -223,7 +220,7 @@ def test_planner_turns_ahead_of_a_target_that_will_leave_its_view(velocity: floa
     state = state._replace(sensors=torch.zeros(1, 1, 2), heading=zero, targets=target, last=target - move)
     actions = []
     for _ in range(24):  # then it is out of range
-        chosen = sensors.planner(cfg, state, generator(0))
+        chosen = sensors.planner(cfg, state, seeded(0))
         actions.append(int(chosen))
         heading = state.heading + torch.tensor(coverage.TURNS)[chosen]
         state = state._replace(heading=heading, targets=state.targets + move, last=state.targets)
@@ -245,12 +242,12 @@ def test_a_policy_acts_for_any_number_of_sensors_without_knowing_goals(name: str
     cfg = coverage.Config(agents=n, targets=4)
     state = drawn(cfg, 5, n)
     hidden = state._replace(goal=-state.goal, speed=state.speed + 10, trip=state.trip + 50, before_last=state.last + 1)
-    action = COVERAGE[name](cfg, state, generator(0))
+    action = COVERAGE[name](cfg, state, seeded(0))
     assert action.shape == (5, n)
     assert action.dtype == torch.int64
     assert set(action.flatten().tolist()) <= {0, 1, 2}
-    assert torch.equal(action, COVERAGE[name](cfg, hidden, generator(0)))
-    make_env(cfg, 5, generator(0)).reset()
+    assert torch.equal(action, COVERAGE[name](cfg, hidden, seeded(0)))
+    make_env(cfg, 5, seeded(0)).reset()
 
 
 @pytest.mark.parametrize("name", ["best_window", "set_point", "hold"])
@@ -258,14 +255,14 @@ def test_a_sensor_with_nothing_in_range_holds(name: str) -> None:
     cfg = coverage.Config(agents=2)
     state = drawn(cfg, 4, 0)
     far = state._replace(targets=torch.full_like(state.targets, 1250), sensors=torch.full_like(state.sensors, -750))
-    assert not COVERAGE[name](cfg, far, generator(0)).any()
+    assert not COVERAGE[name](cfg, far, seeded(0)).any()
     assert not sensors.free_heading_bound(cfg, far).any()
     assert not sensors.range_bound(cfg, far).any()
 
 
 def test_random_takes_every_action_alike() -> None:
     state = drawn(coverage.Config(), 1000, 0, steps=0)
-    counts = COVERAGE["random"](coverage.Config(), state, generator(0)).flatten().bincount()
+    counts = COVERAGE["random"](coverage.Config(), state, seeded(0)).flatten().bincount()
     assert (counts / 4000 - 1 / 3).abs().max() < 0.03
 
 
@@ -275,7 +272,7 @@ def test_random_takes_every_action_alike() -> None:
 @given(seeds, st.integers(1, 6))
 @quick
 def test_match_is_the_optimal_assignment(seed: int, n: int) -> None:
-    cost = torch.rand(5, n, n, generator=generator(seed))
+    cost = torch.rand(5, n, n, generator=seeded(seed))
     columns = steering.match(cost)
     for matrix, mine in zip(cost, columns, strict=True):
         assert sorted(mine.tolist()) == list(range(n))
@@ -287,7 +284,7 @@ def test_match_is_the_optimal_assignment(seed: int, n: int) -> None:
 @pytest.mark.parametrize("continuous", [False, True])
 def test_steering_comes_to_rest_at_the_landmark(order: Any, continuous: bool) -> None:
     cfg = navigation.Config(agents=1, order=order, continuous=continuous)
-    rng = generator(0)
+    rng = seeded(0)
     state = navigation.initial(cfg, 200, rng)
     state = state._replace(velocity=torch.rand(200, 1, 2, generator=rng) * 2 - 1)
     own = torch.zeros(200, 1, dtype=torch.int64)
@@ -300,7 +297,7 @@ def test_steering_comes_to_rest_at_the_landmark(order: Any, continuous: bool) ->
 @given(seeds, st.sampled_from(("mpe2", "mpe1")))
 @quick
 def test_steering_takes_the_force_that_coasts_nearest(seed: int, order: Any) -> None:
-    cfg, rng = navigation.Config(agents=1, order=order), generator(seed)
+    cfg, rng = navigation.Config(agents=1, order=order), seeded(seed)
     state = navigation.initial(cfg, 8, rng)
     state = state._replace(velocity=torch.rand(8, 1, 2, generator=rng) * 2 - 1)
     chosen = steering.steer(cfg, state, torch.zeros(8, 1, dtype=torch.int64))
@@ -319,9 +316,9 @@ def test_steering_takes_the_force_that_coasts_nearest(seed: int, order: Any) -> 
 def test_a_policy_steers_any_number_of_agents(name: str, continuous: bool) -> None:
     for n in range(1, 7):
         cfg = navigation.Config(agents=n, continuous=continuous)
-        env = make_env(cfg, 3, generator(n))
+        env = make_env(cfg, 3, seeded(n))
         env.reset()
-        action = POLICIES["navigation"][name](cfg, env.state, generator(0))
+        action = POLICIES["navigation"][name](cfg, env.state, seeded(0))
         assert action.shape == ((3, n, 2) if continuous else (3, n))
         assert action.is_floating_point() is continuous
         assert action.abs().max() <= (1 if continuous else 4)
@@ -399,7 +396,7 @@ def test_the_episodes_depend_on_the_seed_alone(monkeypatch: pytest.MonkeyPatch) 
 def test_numbers_are_means_over_whole_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
     """The score of `hold` in three chunks, recomputed with the environment itself."""
     monkeypatch.setattr(scores, "CHUNK", 4)
-    cfg, rng = coverage.Config(), generator(3)
+    cfg, rng = coverage.Config(), seeded(3)
     cover, reward = [], []
     for batch in (4, 4, 2):
         env = make_env(cfg, batch, rng)
@@ -422,10 +419,10 @@ def test_numbers_are_means_over_whole_episodes(monkeypatch: pytest.MonkeyPatch) 
 def test_the_bounds_hold_step_by_step_for_every_policy() -> None:
     cfg = coverage.Config()
     for policy in COVERAGE.values():
-        rng = generator(0)
+        rng = seeded(0)
         state = coverage.initial(cfg, 20, rng)
         for _ in range(5):
-            action = policy(cfg, state, generator(1))
+            action = policy(cfg, state, seeded(1))
             state = coverage.transition(cfg, state, action, rng)
             seen = coverage.outcome(cfg, state, action, None).info["coverage"]
             free, in_range = (bound(cfg, state) for bound in BOUNDS["coverage"].values())
