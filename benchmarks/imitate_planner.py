@@ -1,4 +1,4 @@
-"""What limits a policy that acts on what it sees at once: how well networks copy the 30-step planner. Prints Markdown.
+"""The limit of policies without memory, as the accuracy with which networks copy the 30-step planner. Prints Markdown.
 
 Coverage `flat`, 4 x 5, `extended` observation, pairwise encoder. The planner names the action in every state that the
 network's own play visits (DAgger, Ross et al. 2011; the planner acts in a falling share of the first 50 k steps), the

@@ -1,4 +1,4 @@
-"""What tests of several rooms build from: generators, observations, and networks with known outputs."""
+"""Parts that tests of several rooms build from: generators, observations, and networks with known outputs."""
 
 import io
 from collections.abc import Callable

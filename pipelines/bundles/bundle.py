@@ -40,7 +40,7 @@ LINE = 400  # characters of a fault
 
 
 class Packed(NamedTuple):
-    """What went into a bundle, in runs."""
+    """The runs that went into a bundle."""
 
     planned: int
     finished: int
@@ -49,7 +49,7 @@ class Packed(NamedTuple):
 
 
 class Taken(NamedTuple):
-    """What came of a bundle, in runs; `foreign` of them were made by code that is not the code here."""
+    """The runs that came out of a bundle; `foreign` of them were made by code that is not the code here."""
 
     study: str
     profile: str
@@ -113,7 +113,7 @@ def _beside(part: Path, out: Path) -> Iterator[Path]:
 
 
 def _check_packed(folder: Path, out: Path) -> None:
-    """What import would refuse is not written: better known here than there."""
+    """Refuse to write a bundle that import would refuse: better known here than there."""
     try:
         with opened(folder) as files:
             read(files)
@@ -273,7 +273,7 @@ def _log(tracker: Tracker, study: StudyCard, entry: Entry, stock: Stock, adopted
 
 
 def _goes_further(entry: Entry, home: Home, files: Files) -> bool:
-    """Whether a run under way has got further in the bundle than here."""
+    """True if a run under way has got further in the bundle than here."""
     if entry.finished:
         return False
     newest = states_of(files, entry)[-1]

@@ -1,4 +1,4 @@
-"""What a bundle says of its study and its runs, and their values: one strict model, checked as a whole."""
+"""The statements of a bundle on its study, its runs and their values: one strict model, checked as a whole."""
 
 import hashlib
 import json
@@ -71,7 +71,7 @@ def _text_fault(text: str) -> str:
 
 
 def metric_fault(metric: str) -> str:
-    """What is wrong with the name of a metric, or nothing."""
+    """The fault of the name of a metric, or nothing."""
     kind = next((group for group in GROUPS if metric.startswith(group)), "")
     plain = metric.removeprefix(kind).replace("_", "").replace(".", "").replace("-", "")
     if kind and plain.isascii() and plain.isalnum() and len(metric) <= 200:
@@ -94,7 +94,7 @@ Metric = Annotated[str, AfterValidator(partial(_sound, metric_fault))]
 
 
 class Manifest(Frozen):
-    """What a bundle says of itself."""
+    """The statements of a bundle on itself."""
 
     format: Literal[4]
     study: StudyName
@@ -163,7 +163,7 @@ class Entry(NamedTuple):
 
     @property
     def files(self) -> str:
-        """How the names of its files begin."""
+        """The beginning of the names of its files."""
         return f"policies/{self.key}.pt" if self.finished else f"checkpoints/{self.key}/"
 
 
@@ -183,7 +183,7 @@ class Told(NamedTuple):
 
 
 def read(files: Files) -> Told:
-    """What a bundle says, all of it checked but for the content of its policies and checkpoints.
+    """The statements of a bundle, all of it checked but for the content of its policies and checkpoints.
 
     Raises:
         BundleError: something is not as `pack` writes it.
@@ -386,7 +386,7 @@ def _spec(where: str, config: str) -> RunSpec:
 
 
 def _within(part: Any, whole: Any) -> bool:
-    """Whether all that is given is there as it is given, so that nothing was read as something else."""
+    """True if all that is given is there as it is given, so that nothing was read as something else."""
     if isinstance(part, dict) and isinstance(whole, dict):
         return part.keys() <= whole.keys() and all(_within(value, whole[key]) for key, value in part.items())
     return type(part) is type(whole) and bool(part == whole)
@@ -431,7 +431,7 @@ def _check_curve(where: str, entry: Entry) -> None:
 
 
 def on_grid(cfg: Config, step: int) -> bool:
-    """Whether some point of a run's evaluation grid is at this step."""
+    """True if some point of a run's evaluation grid is at this step."""
     point = max(0, (step - cfg.num_envs) * cfg.evaluations // cfg.steps + 1)  # the first that may be as late
     return point <= cfg.evaluations and grid_step(cfg, point) == step
 

@@ -118,7 +118,7 @@ def _value_fault(value: Any) -> str:
 
 
 def _check_progress(name: str, point: str, state: dict[str, Any], entry: Entry) -> None:
-    """What a checkpoint says of how far it is."""
+    """The progress that a checkpoint states."""
     trainer, history, seconds = state.get("trainer"), state.get("history"), state.get("seconds")
     if not (isinstance(trainer, dict) and trainer.keys() == TRAINER and isinstance(history, list)):
         raise BundleError(f"{name}: not a checkpoint of a run under way; it has trainer, history and seconds")

@@ -70,7 +70,7 @@ def missing_devices(where: Iterable[tuple[str, str]]) -> Iterator[str]:
 
 
 def _apart(studies: Sequence[Study]) -> Iterator[str]:
-    """Why studies cannot be launched together."""
+    """The reason why studies cannot be launched together."""
     first = studies[0]
     yield from given_twice(studies)
     for study in studies:
@@ -110,7 +110,7 @@ def guarded(home: Path, names: Sequence[tuple[str, str]], launch: Callable[[Home
 
 
 class Interrupts:
-    """What Ctrl-C and SIGTERM do: while runs train, the first asks each of them to save itself and end, the second
+    """Effect of Ctrl-C and SIGTERM: while runs train, the first asks each of them to save itself and end, the second
     leaves at once; before and afterwards there is nothing to save, and the first leaves at once.
 
     Attributes:
@@ -156,7 +156,7 @@ class Interrupts:
 
 
 class Code(NamedTuple):
-    """What a launch says of its runs: the same for all of its studies."""
+    """The code and machine that a launch logs with its runs: the same for all of its studies."""
 
     commit: str
     host: Host
@@ -286,7 +286,7 @@ def _summary(launched: Sequence[Launched]) -> None:
 
 
 def _arguments(studies: Sequence[Study]) -> str:
-    """What names these plans on the command line, which gives all of them the same options."""
+    """The command-line arguments that name these plans; the command line gives all of them the same options."""
     study = studies[0]
     changes = [word for text in study.overrides for word in ("--set", text)]
     variant = ["--variant", study.variant] if study.variant else []
@@ -343,7 +343,7 @@ def show_status(study: Study, home: Path, *, as_json: bool = False) -> int:
 
 
 class Standing(NamedTuple):
-    """How far a study is."""
+    """The progress of a study."""
 
     finished: bool  # all of it
     arms: dict[str, dict[str, int]]  # runs by state

@@ -30,7 +30,7 @@ CONFIG = pa.field("config", pa.string())  # the spec as canonical JSON
 
 
 def folder(profile: str) -> Path:
-    """Where the repository holds the results of a profile."""
+    """The folder where the repository holds the results of a profile."""
     small = RESULTS / "published" / profile
     return small if small.is_dir() else RESULTS / profile / "runs"
 

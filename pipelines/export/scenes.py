@@ -108,7 +108,7 @@ def _counterexample(by: Literal["reward", "count"]) -> Record:
 
 
 def _instance(kept: list[Tensor], held: Tensor) -> Record:
-    """What each agent's options complete, N times (D_i, M), who is assigned to what (N, M), and both paths."""
+    """The targets that each agent's options complete, N times (D_i, M), the assignment (N, M), and both paths."""
     options = _padded(kept)
     paths = {"algorithm_1": algorithm1_path(options, held, ALPHA), "optimum": optimal_path(options, held, ALPHA)}
     return {
@@ -141,7 +141,7 @@ def _met(horizon: int, policy: str = "nearest") -> Met:
 
 
 def _distinct(met: Met, index: int) -> list[Tensor]:
-    """What each agent can complete of its own targets, each set once, in the order of its options: N times (D_i, M)."""
+    """The sets of its own targets that each agent can complete, in the order of its options: N times (D_i, M)."""
     held = met.options[index] & met.assignment[index].unsqueeze(1)
     rows = [list(dict.fromkeys(tuple(row) for row in agent.tolist())) for agent in held]
     return [torch.tensor(row) for row in rows]

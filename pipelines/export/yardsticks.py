@@ -65,7 +65,7 @@ class Scored(NamedTuple):
 
 
 def evaluations(profile: str) -> list[Evaluation]:
-    """What the report of a profile uses, the slowest first: no process should begin with a long one at the end."""
+    """The evaluations that a profile's report uses, the slowest first, so that none of them begins late."""
     found = []
     for env in TASKS:
         slow = tuple(name for name in names(env.kind) if name in SLOW)
@@ -106,7 +106,7 @@ class Tables(NamedTuple):
 
 
 def present(out: Path) -> Tables:
-    """What a folder has already.
+    """The tables that a folder has already.
 
     Raises:
         InputError: there is another file under one of the names.
@@ -157,7 +157,7 @@ def _files(out: Path) -> tuple[Path, ...]:
 
 
 def _here() -> Row:
-    """How and where scores of today are made; the time of a single policy is not taken."""
+    """The machine and code that make the scores; the time of a single policy is not taken."""
     return {"commit": commit(), "seconds": 0.0, "adopted": ""} | host()._asdict()
 
 

@@ -31,7 +31,7 @@ class Policy(NamedTuple):
 
 
 class EvaluationEpisodes(NamedTuple):
-    """What to play: None stands for what the run itself ended with."""
+    """The episodes to play; None stands for the value of the run's own final evaluation."""
 
     episodes: int | None = None
     seed: int | None = None

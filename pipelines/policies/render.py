@@ -27,7 +27,7 @@ Act = Callable[[Any], tuple[Tensor, Tensor | None]]  # state -> action (1, N[, A
 
 
 def trained(actor: policy.Actor) -> Act:
-    """How a trained policy acts in a state."""
+    """The action of a trained policy in a state."""
     observe = ENVS[actor.env.kind].physics.observe
 
     def act(state: Any) -> tuple[Tensor, Tensor | None]:
@@ -38,7 +38,7 @@ def trained(actor: policy.Actor) -> Act:
 
 
 def yardstick(env: EnvConfig, name: str, episode: int) -> Act:
-    """How a policy without learning acts; its own draws have a generator of their own.
+    """The action of a policy without learning; its own draws have a generator of their own.
 
     Raises:
         InputError: the task has no such policy.

@@ -43,7 +43,7 @@ class Size(NamedTuple):
 
 
 def sizes(policy: Policy, agents: Sequence[int], targets: Sequence[int]) -> list[Size]:
-    """What to play: the trained numbers, other numbers of agents with them, and other numbers of targets with them."""
+    """Sizes to play: the trained numbers, and those with another number of agents, or of targets."""
     env = policy.saved.spec.env
     own = Size(env.agents, getattr(env, "targets", env.agents))
     changed = [Size(n, own.targets) for n in agents] + [Size(own.agents, m) for m in targets]

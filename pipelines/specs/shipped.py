@@ -11,7 +11,7 @@ SHIPPED = Path(__file__).parents[1] / "studies"
 
 
 def names() -> list[str]:
-    """What can be copied."""
+    """The files that can be copied."""
     return sorted(path.stem for path in SHIPPED.glob("*.yaml"))
 
 

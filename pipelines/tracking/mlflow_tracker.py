@@ -367,7 +367,7 @@ class MlflowTracker:
             return _copied(self.keeps(ref), name, folder)
 
     def files_of(self, ref: str) -> str:
-        """Where the files of a run are looked for."""
+        """The place where the files of a run are looked for."""
         with explained(self.uri):
             stored = self.client.get_run(ref).info.artifact_uri
             return str(moved.run_folder(stored, self.home, own=self.own) or stored)
@@ -379,12 +379,12 @@ class MlflowTracker:
         return get_artifact_repository(there.as_uri() if there else stored, tracking_uri=self.uri)
 
     def where(self) -> str:
-        """How to look at the experiment: a command, or a server's address."""
+        """The way to look at the experiment: a command, or a server's address."""
         return without_password(self.uri) if self.served else "rhmc ui"
 
     @property
     def served(self) -> bool:
-        """Whether a server keeps the log, and its files."""
+        """True if a server keeps the log, and its files."""
         return self.uri.startswith(SERVER)
 
 
@@ -462,7 +462,7 @@ def fitting(note: str) -> str:
 
 
 def keys_of(metrics: Collection[str] | None) -> set[str] | None:
-    """What metrics of the program may be called in MLflow; None for all."""
+    """The names that metrics of the program may have in MLflow; None for all."""
     return None if metrics is None else {name for metric in metrics for name in (metric, names.shown(metric))}
 
 
@@ -566,7 +566,7 @@ def open_existing(study: StudyCard, home: Home) -> MlflowTracker | None:
 
 
 def _empty(file: Path) -> bool:
-    """Whether there is no database yet; a device or a pipe in its place is none and never will be."""
+    """True if there is no database yet; a device or a pipe in its place is none and never will be."""
     return not file.exists() or (file.is_file() and file.stat().st_size == 0)
 
 

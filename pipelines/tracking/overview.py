@@ -1,4 +1,4 @@
-"""What the parent run of a study shows: its question and arms, the results so far, their curves and table.
+"""The content of a study's parent run: its question and arms, the results so far, their curves and table.
 
 Means and ranges over seeds only, to look at while a study runs. Intervals and verdicts are the report's.
 """
@@ -36,7 +36,7 @@ Point = tuple[int, float]  # step, value
 
 
 class Run(NamedTuple):
-    """What is shown of one run."""
+    """The part of a run that is shown."""
 
     arm: str
     seed: int
@@ -229,7 +229,7 @@ def _drawn(study: StudyCard, runs: Sequence[Run]) -> "Figure":
 
 
 def _common(mine: Sequence[Run]) -> tuple[int, list[int], list[list[float]]] | None:
-    """How many runs, the steps that all of them have, and their values there."""
+    """The number of runs, the steps that all of them have, and their values there."""
     begun = [run for run in mine if run.curve]
     curves = [dict(run.curve) for run in begun if run.status == "finished"] or [dict(run.curve) for run in begun]
     if not curves:

@@ -55,7 +55,7 @@ class View(NamedTuple):
 
     @property
     def query(self) -> str:
-        """What opens it, after `#/experiments/<id>/runs?`."""
+        """The query that opens it, after `#/experiments/<id>/runs?`."""
         return f"workflowType=machine_learning&viewStateShareKey={self.key}&compareRunsMode={self.mode}"
 
     def written(self, created: int) -> str:
@@ -112,7 +112,7 @@ def _base(params: Params, legends: Sequence[str]) -> State:
 
 
 def _names(params: Params) -> list[str]:
-    """What varies in any kind of run."""
+    """The columns that vary in any kind of run."""
     return list(dict.fromkeys(name for names in params.values() for name in names))
 
 

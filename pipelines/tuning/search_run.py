@@ -83,12 +83,12 @@ def run_search(search: Search, home: Path, out: Path | None = None) -> int:
 
 
 def best_params_folder(search: Search, home: Home) -> Path:
-    """Where the winners go."""
+    """The folder of the best settings."""
     return plots_folder(search, home) / "best_params" if search.overrides else Path(search.file).parent / "best_params"
 
 
 def plots_folder(search: Search, home: Home) -> Path:
-    """Where the plots go."""
+    """The folder of the plots."""
     return home.root / "searches" / f"{search.name}-{search.profile}"
 
 
@@ -223,7 +223,7 @@ class Drive:
         )
 
     def _take(self, key: str, result: "dict[str, Any] | Failed") -> None:
-        """What a worker reports of a trial."""
+        """Take in what a worker reports of a trial."""
         one = self.running[key]
         if not isinstance(result, dict):
             self._end(key)

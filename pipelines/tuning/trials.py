@@ -52,7 +52,7 @@ class TrialRequest(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What a person calls it."""
+        """The name for people."""
         return f"{self.arm} t{self.trial_index}"
 
 
@@ -211,7 +211,7 @@ class ArmStudy:
         return Best(trial_index, trial.params, value, trial.user_attrs["returns"])
 
     def counts(self) -> dict[str, int]:
-        """How many trials of the budget are in which state."""
+        """The number of trials of the budget in each state."""
         states = [trial.state for trial in self.latest().values()]
         names = {"complete": TrialState.COMPLETE, "pruned": TrialState.PRUNED, "running": TrialState.RUNNING}
         names |= {"waiting": TrialState.WAITING, "failed": TrialState.FAIL}
@@ -225,7 +225,7 @@ def trial_index_of(trial: FrozenTrial) -> int | None:
 
 
 def values_of(trial: FrozenTrial) -> dict[str, Any]:
-    """What a trial tries, also while it waits."""
+    """The values that a trial tries, also while it waits."""
     return trial.params | trial.system_attrs.get("fixed_params", {})
 
 
@@ -278,7 +278,7 @@ class Asha(SuccessiveHalvingPruner):
     """Optuna's, but that a trial does not compete with what was left of it when it was interrupted."""
 
     def prune(self, study: optuna.Study, trial: FrozenTrial) -> bool:
-        """Whether to give the trial up."""
+        """True if to give the trial up."""
         return super().prune(cast(optuna.Study, _Standing(study)), trial)
 
 

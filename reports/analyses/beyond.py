@@ -1,4 +1,4 @@
-"""What the paper does not show: assignments while training, transfer to other numbers, and what the encoder does."""
+"""Analyses beyond the paper: assignments while training, transfer to other numbers, and the effect of the encoder."""
 
 from collections.abc import Mapping, Sequence
 from itertools import combinations
@@ -77,7 +77,7 @@ def fig_assignments(results: Results, study: str) -> Drawing | None:
 
 
 def table_assignments(results: Results, study: str) -> Table | None:
-    """What arms assign in the first and in the last tenth of their training, and where Algorithm 1 falls short."""
+    """Assignments of arms in the first and last tenth of their training, and the shortfall of Algorithm 1."""
     numbers, shown = [], []
     for arm in assigning(results, study):
         first, last, whole = (_tenths(results, study, arm, part) for part in ("first", "last", "whole"))

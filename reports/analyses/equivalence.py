@@ -25,7 +25,7 @@ HOLDS: tuple[Outcome, ...] = ("byte-equal", "equivalent")
 
 
 class Compared(NamedTuple):
-    """What came of an arm. `difference` (here less published) and `p` where bytes differ, else NaN."""
+    """The comparison of an arm. `difference` (here less published) and `p` where bytes differ, else NaN."""
 
     study: str
     arm: str
@@ -37,7 +37,7 @@ class Compared(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Whether the published result stands."""
+        """True if the published result stands."""
         return self.outcome in HOLDS
 
 

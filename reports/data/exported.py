@@ -50,7 +50,7 @@ def part(path: Path) -> str:
 
 
 def earlier(path: Path) -> bool:
-    """Whether a table of runs has the form in which they still told how and where they were made."""
+    """True if a table of runs has the form in which they still told how and where they were made."""
     try:
         names = _schema(path).names if part(path) == "runs" else []
     except (OSError, ValueError, pa.ArrowException):
@@ -59,7 +59,7 @@ def earlier(path: Path) -> bool:
 
 
 def older(path: Path) -> bool:
-    """Whether a table of runs was exported by an older version, with that version's names of studies and settings."""
+    """True if a table of runs was exported by an older version, with that version's names of studies and settings."""
     try:
         return part(path) == "runs" and VERSION not in (_schema(path).metadata or {}).items()
     except (OSError, ValueError, pa.ArrowException):
@@ -95,7 +95,7 @@ def _why(path: Path, error: Exception) -> str:
 
 
 def _columns(table: pa.Table, wanted: Sequence[str]) -> Iterator[str]:
-    """What is wrong with the columns of a table."""
+    """The fault of the columns of a table."""
     names = table.column_names
     absent = [name for name in wanted if name not in names]
     if absent:
@@ -108,7 +108,7 @@ def _columns(table: pa.Table, wanted: Sequence[str]) -> Iterator[str]:
 
 
 def _faults(column: pa.ChunkedArray, name: str) -> Iterator[str]:
-    """What is wrong with a column: its type, its empty cells, its range."""
+    """The fault of a column: its type, its empty cells, its range."""
     kind, what = _held(column.type), "words"
     fits = _worded(kind)
     if name in (*WHOLE, *NUMBERS):
@@ -133,7 +133,7 @@ def _worded(kind: pa.DataType) -> bool:
 
 
 def _held(kind: pa.DataType) -> pa.DataType:
-    """What a column holds, in a dictionary or as it is."""
+    """The type of a column's values, in a dictionary or as it is."""
     return kind.value_type if pa.types.is_dictionary(kind) else kind
 
 
@@ -175,14 +175,14 @@ class Env(Loose):
 
 
 class Trainer(Loose):
-    """How a run is trained."""
+    """The budget of a run."""
 
     steps: Count | None = None
     final_episodes: Count | None = None
 
 
 class Config(Loose):
-    """What a report looks at in the configuration of a run."""
+    """The part of a run's configuration that a report looks at."""
 
     env: Env = Env()
     algo: dict[str, Any] = {}
@@ -191,7 +191,7 @@ class Config(Loose):
 
 @cache
 def config_fault(text: str) -> str:
-    """What is wrong with the configuration of a run; nothing if it can be used."""
+    """The fault of the configuration of a run; nothing if it can be used."""
     try:
         return "" if Config.model_validate_json(text).model_fields_set else "is no JSON object"
     except ValidationError as error:

@@ -218,7 +218,7 @@ class Results:
         return next((table for task, table in self.yardsticks if env and same_task(env, task)), pd.DataFrame())
 
     def gaps(self, expected: Mapping[str, Sequence[str]]) -> list[str]:
-        """What is not there, in sentences of Markdown; `escape.words` gives them without its marks.
+        """The gaps, in sentences of Markdown; `escape.words` gives them without its marks.
 
         Args:
             expected: arms that the paper has, per study.
@@ -325,7 +325,7 @@ def without_count(arm: str, agents: int) -> str:
 
 
 def same_task(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
-    """Whether two configurations are one task: how it is observed does not count, nor what only one writes out."""
+    """True if two configurations are one task: how it is observed does not count, nor what only one writes out."""
     shared = (a.keys() & b.keys()) - {"observation"}
     return "kind" in shared and all(a[key] == b[key] for key in shared)
 
@@ -339,7 +339,7 @@ def _animation(path: Path) -> bytes:
 
 
 def _of_plan(tables: Mapping[str, pd.DataFrame]) -> tuple[pd.DataFrame, pd.DataFrame, tuple[str, ...]]:
-    """What was watched and played later, without rows of runs that are no longer planned; and which studies had such.
+    """The tables of assignments and transfer, without runs that are no longer planned; and which studies had such.
 
     These tables are made by commands of their own, so they can be older than the plan: not a fault, but not shown.
     """
@@ -462,12 +462,12 @@ def _config(text: str) -> dict[str, Any]:
 
 
 def adopted(runs: pd.DataFrame) -> bool:
-    """Whether older code made some of the runs, and trainings of the present code repeated it."""
+    """True if older code made some of the runs, and trainings of the present code repeated it."""
     return bool(runs["adopted"].astype(bool).any())
 
 
 def mixed(runs: pd.DataFrame) -> bool:
-    """Whether runs of one method in one task were made by different code."""
+    """True if runs of one method in one task were made by different code."""
     known = runs[runs["fingerprint"].fillna("") != ""]
     place = ["algorithm", "task"]
     return len(known[[*place, "fingerprint"]].drop_duplicates()) > len(known[place].drop_duplicates())

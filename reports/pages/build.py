@@ -270,7 +270,7 @@ def _last(results: Results) -> dict[str, Table]:
 
 
 def _study_tables(results: Results, study: str) -> dict[str, Table]:
-    """What is shown of every study."""
+    """The tables that every study has."""
     found = scaling.sweep(results, study)
     steadiness = tables.steadiness(results, study)
     every: dict[str, Table | None] = {
@@ -345,7 +345,7 @@ def _links(folder: str, name: str, first: str, second: str) -> str:
 
 
 def _content(report: Report, pictures: Path) -> Mapping[str, Any]:
-    """What the page shows, by the names of its template."""
+    """The content of the page, by the names of its template."""
     results = report.results
     runs = report.tables["runs"]
     return {
@@ -396,7 +396,7 @@ def _sections(report: Report, pictures: Path) -> list[page.Section]:
 
 
 def _of_study(name: str) -> str:
-    """What follows the kind of a study's table in its name."""
+    """The part of a table's name that follows its kind."""
     kind, _, rest = name.partition("_")
     return rest if kind in KINDS else ""
 
@@ -414,13 +414,13 @@ def _section(report: Report, pictures: Path, name: str, title: str, study: str, 
 
 
 def _parted(found: Mapping[str, Part]) -> tuple[list[Part], list[Part]]:
-    """What is shown at once, and what is folded away."""
+    """The parts that are shown at once, and those that are folded away."""
     shown = [x for key, x in found.items() if not _folded(key)]
     return shown, [x for key, x in found.items() if _folded(key)]
 
 
 def _folded(name: str) -> bool:
-    """Whether a figure or a table is folded away: what looks at the same runs in yet another way."""
+    """True if a figure or a table is folded away: what looks at the same runs in yet another way."""
     return name.startswith(MORE) or name.endswith("_arms")
 
 
@@ -439,7 +439,7 @@ def _question(results: Results, study: str) -> str:
 
 
 def _lead(results: Results) -> str:
-    """How much is behind the report, in a sentence or two."""
+    """The amount of data behind the report, in a sentence or two."""
     runs = results.runs[results.runs["study"].isin(results.studies)]
     done, budgets = int((runs["status"] == "finished").sum()), [results.budget(study) for study in results.studies]
     known = sorted({budget for budget in budgets if budget})
@@ -476,7 +476,7 @@ def _origin(results: Results) -> str:
 
 
 def _count(claims: Table) -> str:
-    """How many claims got each verdict."""
+    """The number of claims with each verdict."""
     counts = claims.numbers["verdict"].value_counts()
     parts = [f"{counts[verdict]} {verdict}" for verdict in VERDICTS if verdict in counts]
     return f"Of {len(claims.numbers)} claims: {', '.join(parts)}."

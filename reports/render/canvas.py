@@ -1,4 +1,4 @@
-"""What all figures share: colours, style, the empty figure, and how a figure becomes files. Same input, same bytes."""
+"""Parts that all figures share: colours, style, the empty figure, the writing of files. Same input, same bytes."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager

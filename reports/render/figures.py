@@ -43,7 +43,7 @@ class Label(NamedTuple):
 
     @property
     def lines(self) -> int:
-        """How many lines they take."""
+        """The number of lines that they take."""
         return self.text.count("\n") + 1
 
 

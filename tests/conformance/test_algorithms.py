@@ -1,4 +1,4 @@
-"""What every method of the table must do, on both encoders and both tasks; and RHMC in its variants."""
+"""The requirements on every method of the table, on both encoders and both tasks; and RHMC in its variants."""
 
 from functools import cache
 from itertools import product
@@ -201,7 +201,7 @@ def learners(thing: Any) -> list[Learner[Any]]:
 
 
 def parts(thing: Any) -> dict[str, Any]:
-    """What hangs on an object of the project, its settings aside."""
+    """The attributes of an object of the project, its settings aside."""
     ours = type(thing).__module__.startswith("rhmc") and hasattr(thing, "__dict__")
     return {key: value for key, value in vars(thing).items() if key != "cfg"} if ours else {}
 
@@ -611,7 +611,7 @@ ON_POLICY = {
 @pytest.mark.parametrize("flag", ["terminal", "truncated", None])
 @pytest.mark.parametrize("case", ON_POLICY.values(), ids=ON_POLICY)
 def test_a_sequence_stops_where_an_episode_ends(case: Case, flag: str | None) -> None:
-    """What happens in the next episode is nothing to the step before; within an episode it is."""
+    """The next episode does not affect the step before; within an episode it is."""
     env, obs = world(case.env, batch=1)
     found = []
     for shift in (0.0, 1.0):

@@ -55,7 +55,7 @@ VARIANTS: dict[str, dict[str, Any]] = {  # beside every method in every task
 
 
 def cases() -> dict[str, Callable[[], str]]:
-    """What is digested, by name; calling one takes a second or two."""
+    """The cases that are digested, by name; calling one takes a second or two."""
     kinds = {kind: {"kind": kind} for kind in ALGORITHMS} | VARIANTS
     found = {f"{name} in {task}": _training(task, algo) for name, algo in kinds.items() for task in ENVS}
     found["maddpg in continuous navigation"] = _training("navigation", {"kind": "maddpg"}, continuous=True)

@@ -95,7 +95,7 @@ def theorem(lost: int = 40) -> Tables:
 
 
 def methods(folder: Path, names: Sequence[str] = ("RHMC", "IQL")) -> Path:
-    """What `rhmc methods --out` writes: sizes 1000 k + 10 for the k-th method, 5 more for each next encoder or task."""
+    """Output of `rhmc methods --out`: sizes 1000 k + 10 for the k-th method, 5 more for each next encoder or task."""
     records = []
     for k, name in enumerate(names, 1):
         texts = {key: f"{key} of {name}" for key in METHOD} | {"kind": name.lower(), "name": name}
@@ -140,7 +140,7 @@ def noisy(mean: float, n: int = 3, spread: float = 1.0) -> list[float]:
 
 
 def drawings(folder: Path) -> Path:
-    """What `rhmc drawings --out` writes, small: a chain and a branched network per role, two states, one instance."""
+    """The output of `rhmc drawings --out`, small: a chain and a branched network per role, two states, one instance."""
     folder.mkdir(parents=True, exist_ok=True)
     builds = [
         {
@@ -223,14 +223,14 @@ def _network(role: str) -> dict[str, Any]:
 
 
 def episode(folder: Path) -> Path:
-    """What `rhmc render` writes, the smallest: a GIF of two by one pixels."""
+    """The output of `rhmc render`, the smallest: a GIF of two by one pixels."""
     gif = bytes.fromhex("47494638396102000100800000ffffff00000021f90400000000002c00000000020001000002020c0a003b")
     (folder / "episode_coverage.gif").write_bytes(gif)
     return folder
 
 
 def assignments(points: pd.DataFrame, arm: str, pairs: Sequence[float], lost: Sequence[float]) -> pd.DataFrame:
-    """What `rhmc assignments` writes of an arm's first run: a point at every 1000 steps."""
+    """The output of `rhmc assignments` of an arm's first run: a point at every 1000 steps."""
     place = points[points["arm"] == arm].iloc[0][["study", "arm", "seed", "run"]].to_dict()
     rows = [
         place | {"step": 1000 * (n + 1), "metric": f"assign/{name}", "value": value}
@@ -244,7 +244,7 @@ def assignments(points: pd.DataFrame, arm: str, pairs: Sequence[float], lost: Se
 
 
 def transfer(points: pd.DataFrame, levels: Mapping[tuple[int, int], float], arm: str = "RHMC") -> pd.DataFrame:
-    """What `rhmc transfer` writes: every seed of an arm a point apart at each size."""
+    """The output of `rhmc transfer`: every seed of an arm a point apart at each size."""
     runs = points[points["arm"] == arm].drop_duplicates("run")
     rows = [
         (r.study, r.arm, r.seed, r.run, "coverage flat", n, m, 4, 5, 200, level + float(str(r.seed)), 0.5)

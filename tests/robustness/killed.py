@@ -60,7 +60,7 @@ SHORTEST = 3  # writes that a fuse lets pass at the most, where a verb has hardl
 
 
 class World(NamedTuple):
-    """What there is before any verb: a finished study, and a bundle of it."""
+    """The state before any verb: a finished study, and a bundle of it."""
 
     home: Path
     bundle: Path
@@ -85,7 +85,7 @@ class Verb(NamedTuple):
 
 
 class End(NamedTuple):
-    """What a verb left."""
+    """The state that a verb left."""
 
     runs: list[Run]
     files: dict[str, bytes]  # below `OUT`
@@ -190,7 +190,7 @@ VERBS = (
 
 
 class PoolHere:
-    """What `Pool` does, one trial at a time in this process."""
+    """The work of `Pool`, one trial at a time in this process."""
 
     def __init__(self, size: int, cpus: int) -> None:
         self.worker, self.key = Worker(), ""
@@ -275,12 +275,12 @@ def fresh(folder: Path, verb: Verb, world: World) -> Path:
 
 
 def log(home: Path) -> str:
-    """What the processes said."""
+    """The output of the processes."""
     return Path(f"{home}.log").read_text(encoding="utf-8")
 
 
 def end_of(verb: Verb, home: Path) -> End:
-    """What a verb left in a folder."""
+    """The files that a verb left in a folder."""
     runs = logged(verb.logs(home), home) if verb.logs else []
     files = {str(path.relative_to(home)): path for path in sorted(home.rglob("*")) if path.is_file()}
     written = {name: path.read_bytes() for name, path in files.items() if name.startswith(f"{OUT}/")}
@@ -290,7 +290,7 @@ def end_of(verb: Verb, home: Path) -> End:
 
 
 def wrong(found: End, wanted: End) -> Counter[str]:
-    """How often each thing went wrong."""
+    """Counts of each fault."""
     counts = faults(found.runs, wanted.runs)
     names = found.files.keys() | wanted.files.keys()
     left = found.names - wanted.names
@@ -311,7 +311,7 @@ WRONG = tuple(wrong(End([], {}, Counter()), End([], {}, Counter())))
 
 
 class Disturbed(NamedTuple):
-    """What came of a verb."""
+    """The outcome of a verb."""
 
     kills: int
     starts: int

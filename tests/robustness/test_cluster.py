@@ -222,7 +222,7 @@ class Listener:
 
 
 def lives(deaths: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What a recorder is told while workers die, W, or their node, N, or get further, -, as Tune has it."""
+    """The events that a recorder is told while workers die, W, or their node, N, or get further, -, as Tune has it."""
     monkeypatch.setattr(cluster, "alive", dict)
     listener = Listener()
     bridge = Bridge(listener, folder / "stop")  # type: ignore[arg-type]
@@ -268,7 +268,7 @@ def test_dead_nodes_cost_no_attempt(deaths: str, end: str, tmp_path: Path, monke
 
 
 class Site(NamedTuple):
-    """What past one machine is there."""
+    """The addresses of a cluster of several machines."""
 
     database: str  # address without a name
     uri: str  # MLflow
@@ -308,7 +308,7 @@ class Launch:
         self.process, self.log = process, log
 
     def said(self) -> str:
-        """What it has said so far. It must not have ended with another exit code than 0."""
+        """The output so far. It must not have ended with another exit code than 0."""
         assert self.process.poll() in (None, 0), self.log.read_text()
         return self.log.read_text()
 

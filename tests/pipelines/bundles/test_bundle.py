@@ -972,7 +972,7 @@ def undisturbed(good: Path, tmp_path_factory: pytest.TempPathFactory, template: 
 
 
 def tree(home: Path) -> set[str]:
-    """What lies in a work folder, but for what has a name that MLflow makes up."""
+    """The content of a work folder, except what has a name that MLflow makes up."""
     named = (path.relative_to(home).parts for path in home.rglob("*"))
     return {"/".join(parts) for parts in named if parts[0] != "artifacts"}
 

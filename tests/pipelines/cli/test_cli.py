@@ -588,7 +588,7 @@ def test_a_worker_that_is_killed_writes_nothing(rhmc: Rhmc, monkeypatch: pytest.
 
 
 def die(evaluation: yardsticks.Evaluation) -> None:
-    """What a lack of memory does to a worker."""
+    """The effect of a lack of memory on a worker."""
     os.kill(os.getpid(), signal.SIGKILL)
 
 

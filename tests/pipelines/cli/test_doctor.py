@@ -1,4 +1,4 @@
-"""What the doctor says of installations that are well and of those that are not."""
+"""The doctor's findings on installations that are well and of those that are not."""
 
 import sys
 from contextlib import nullcontext

@@ -59,7 +59,7 @@ def launch(shelf: list[MemoryRun], tmp_path: Path) -> Launch:
 
 
 def finish(recorder: Recorder, key: str) -> None:
-    """What a worker does at its end."""
+    """The actions of a worker at its end."""
     folder = recorder.home.checkpoints(key)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "policy.pt").write_bytes(b"weights")

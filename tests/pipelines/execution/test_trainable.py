@@ -61,12 +61,12 @@ def finish(run: RunTrainable) -> list[dict[str, Any]]:
 
 
 def points(results: list[dict[str, Any]]) -> list[dict[str, float]]:
-    """What training gave, clocks aside."""
+    """The values of training, clocks aside."""
     return [{k: v for k, v in p.items() if not k.startswith("time/")} for r in results for p in r["points"]]
 
 
 def same(a: Any, b: Any) -> bool:
-    """Whether two states are equal, bit for bit."""
+    """True if two states are equal, bit for bit."""
     if isinstance(a, torch.Tensor):
         return a.dtype == b.dtype and torch.equal(a, b)
     if isinstance(a, dict):
@@ -136,7 +136,7 @@ class Broken(io.BufferedReader):
 
 
 def system(code: int) -> Callable[..., Any]:
-    """What the system refuses."""
+    """Errors that the system raises."""
 
     def refuse(*args: Any, **options: Any) -> Any:
         raise OSError(code, os.strerror(code))
@@ -145,7 +145,7 @@ def system(code: int) -> Callable[..., Any]:
 
 
 def lack(error: Exception) -> Callable[..., Any]:
-    """What torch or zipfile raise."""
+    """Errors that torch or zipfile raise."""
 
     def refuse(*args: Any, **options: Any) -> Any:
         raise error

@@ -1,4 +1,4 @@
-"""What the pipeline declares is the same bytes wherever results are equal, and `make repro` ends by saying so."""
+"""Declared outputs are the same bytes wherever results are equal, and the last line of `make repro` says so."""
 
 import os
 import shutil
@@ -38,7 +38,7 @@ def deps(stage: str) -> set[str]:
 
 
 class World(NamedTuple):
-    """Where and when the same results are made."""
+    """The place and time where the same results are made."""
 
     commit: str
     host: Host

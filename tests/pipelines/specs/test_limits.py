@@ -1,4 +1,4 @@
-"""What a check finds before a launch: numbers that are absurd, devices, what cannot go together, budgets too small."""
+"""Findings of a check before a launch: numbers that are absurd, devices, what cannot go together, budgets too small."""
 
 from pathlib import Path
 from typing import Any

@@ -651,7 +651,7 @@ def test_merging_without_kinds(a: dict, b: dict, c: dict) -> None:
 
 
 def mixed(*trees: dict) -> bool:
-    """Whether a key holds a mapping in one tree and something else in another, at any depth."""
+    """True if a key holds a mapping in one tree and something else in another, at any depth."""
     for key in {key for tree in trees for key in tree}:
         values = [tree[key] for tree in trees if key in tree]
         mappings = [value for value in values if isinstance(value, dict)]

@@ -368,7 +368,7 @@ def test_where_the_log_lies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def refused(home: Path) -> str:
-    """What opening the log says."""
+    """The remarks of an opened log."""
     with pytest.raises(StoreError) as caught:
         MlflowTracker(STUDY, Home(home))
     assert "\n" not in str(caught.value)

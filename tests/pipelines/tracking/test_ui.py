@@ -1,4 +1,4 @@
-"""What a person sees in MLflow: names, saved views, and the parent run of a study."""
+"""The view of MLflow: names, saved views, and the parent run of a study."""
 
 import base64
 import csv

@@ -332,7 +332,7 @@ def point(curves: dict[int, list[float]], k: int, last: int) -> dict[str, float]
 
 
 class World:
-    """What outlives a launch: Optuna's storage, the log and the checkpoints."""
+    """The state that outlives a launch: Optuna's storage, the log and the checkpoints."""
 
     def __init__(self, search: Search, folder: Path, storage: Any = None) -> None:
         self.search, self.folder = search, folder
@@ -355,7 +355,7 @@ class World:
         return workers
 
     def outcome(self) -> dict[str, Any]:
-        """What came of every place of every arm, and what the log shows."""
+        """The result of every trial of every arm, and the log's content."""
         trials = {
             (arm_study.arm, place): (t.state.name, t.params, t.values, t.intermediate_values)
             for arm_study in self.arm_studies()

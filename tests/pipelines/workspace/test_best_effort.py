@@ -1,4 +1,4 @@
-"""What is only looked at never ends a launch, and shows names as they were typed."""
+"""Output that is only looked at never ends a launch, and shows names as they were typed."""
 
 import io
 from collections.abc import Callable

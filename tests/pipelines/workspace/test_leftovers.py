@@ -1,4 +1,4 @@
-"""What a killed process leaves is swept by the next that does the same; what a living one uses is left alone."""
+"""Files of a killed process are swept by the next that does the same; files of a living one are left alone."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""What is wrong in a table is said in one line; what is not there yet is missing, never zero."""
+"""A fault in a table is reported in one line; values that are not there yet are missing, never zero."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -38,7 +38,7 @@ def config(**changes: Any) -> Config:
 
 
 class Product(nn.Module):
-    """What a pair adds, made easy: its own number times the mean of those before it, plus its own number."""
+    """The contribution of a pair, made easy: its own number times the mean of those before it, plus its own number."""
 
     def forward(self, both: Tensor) -> Tensor:
         before, own = both.chunk(2, -1)

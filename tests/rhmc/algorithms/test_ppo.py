@@ -159,7 +159,7 @@ def test_nothing_is_learned_before_a_rollout_is_full() -> None:
 
 
 def judged(monkeypatch: pytest.MonkeyPatch, algo: PPO) -> tuple[Tensor, Tensor, Tensor]:
-    """What an update hands to the objective as advantages, and to the critic's loss as values and targets."""
+    """Values that an update hands to the objective as advantages, and to the critic's loss as values and targets."""
     seen: list[Tensor] = []
     loss, objective = ppo.huber_loss, algo.objective
 
@@ -275,7 +275,7 @@ def test_the_first_update_starts_from_the_policy_that_acted(objective: str) -> N
 
 @pytest.mark.parametrize("entropy", [0.0, 0.1])
 def test_entropy_alone_makes_a_policy_uniform(entropy: float) -> None:
-    """Where no action is better than another, and only then with a weight."""
+    """The loss where no action is better than another, and only then with a weight."""
     algo = method(entropy=entropy, rollout=1, epochs=20, lr=0.01)
     constant(algo.actor.net, [1.0, 0.0, 0.0])
     constant(algo.critic.net, [0.0])
@@ -347,7 +347,7 @@ def test_the_first_policy_is_nearly_uniform(encoder: Any) -> None:
 
 
 def test_the_last_layer_is_the_one_that_puts_out() -> None:
-    """What `orthogonal` takes for the last layer is so in every network that it is given."""
+    """The layer that `orthogonal` takes for the last is the last in every network that it is given."""
     sizes = Sizes.of(SPEC)
     for encoder in ENCODERS.values():
         for make in (encoder.local, encoder.central):

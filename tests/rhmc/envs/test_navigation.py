@@ -393,7 +393,7 @@ def lone_state(seed: int, batch: int, *, speed: float) -> navigation.State:
 
 
 def travel(cfg: navigation.Config, state: navigation.State, plan: Tensor) -> Tensor:
-    """Whether the lone agents of (B,) worlds cover their landmark after any step of a plan (K, ...): (B,)."""
+    """True if the lone agents of (B,) worlds cover their landmark after any step of a plan (K, ...): (B,)."""
     hit = torch.zeros(len(state.steps), dtype=torch.bool)
     for action in plan:
         state = navigation.transition(cfg, state, action.expand(len(hit), *action.shape), seeded(0))
@@ -438,7 +438,7 @@ def test_wherever_a_plan_leads_is_reachable(
 def test_the_table_is_no_larger_than_what_a_steady_force_reaches(
     seed: int, order: Any, horizon: int, continuous: bool
 ) -> None:
-    """What it says is reachable, some steady force reaches: any in the square, or |x| + |y| <= 1 if discrete."""
+    """States called reachable are reached by a steady force: any in the square, or |x| + |y| <= 1 if discrete."""
     cfg = navigation.Config(agents=1, order=order, continuous=continuous)
     free = cfg.model_copy(update={"continuous": True})
     state = lone_state(seed, 30, speed=2.0)

@@ -31,14 +31,14 @@ def config(**changes: Any) -> Config:
 
 
 def rows(batch: int = 1, terminal: bool = False, **changes: Tensor) -> Batch:
-    """What both levels may be given; rewards are added by the test."""
+    """The columns that both levels may be given; rewards are added by the test."""
     held = (torch.rand(batch, N, M) < 0.5).float()
     some = observed(SPEC, batch)
     return some | {"assignment": held, "terminal": torch.full((batch,), terminal)} | changes
 
 
 def outputs(net: nn.Module, call: Any) -> list[Tensor]:
-    """What a network returns during a call."""
+    """The outputs of a network during a call."""
     seen: list[Tensor] = []
     handle = net.register_forward_hook(lambda module, inputs, out: seen.append(out.detach().clone()))
     call()
@@ -255,7 +255,7 @@ class Taught(PairNet):
 
 
 def flipped(critic: nn.Module, obs: Obs) -> Tensor:
-    """What a critic says after each pair's last feature in turn is made the other: (B, N, M)."""
+    """The value of a critic after each pair's last feature in turn is made the other: (B, N, M)."""
     out = torch.empty(obs.pairs.shape[:3])
     for i, j in product(range(out.shape[1]), range(out.shape[2])):
         pairs = obs.pairs.clone()

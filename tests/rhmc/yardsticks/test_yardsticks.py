@@ -52,7 +52,7 @@ def drawn(cfg: coverage.Config, batch: int, seed: int, steps: int = 10) -> cover
 
 
 def settled(cfg: coverage.Config, state: coverage.State, policy: Any, steps: int = 60) -> coverage.State:
-    """Where the policy ends while the targets stand still."""
+    """The state where the policy ends while the targets stand still."""
     for _ in range(steps):
         turn = torch.tensor(coverage.TURNS)[policy(cfg, state, seeded(0))]
         state = state._replace(heading=coverage.wrap(state.heading + turn), last=state.targets)
@@ -60,7 +60,7 @@ def settled(cfg: coverage.Config, state: coverage.State, policy: Any, steps: int
 
 
 def sets_in_view(state: coverage.State, b: int, i: int) -> set[frozenset[int]]:
-    """What sensor i of row b sees under headings all round: every degree, and just before a target enters or leaves."""
+    """Targets that sensor i of row b sees under headings all round: each degree, and just before one enters or leaves."""
     world = oracle.World(
         [(float(x), float(y)) for x, y in state.sensors[b]],
         [0.0] * state.sensors.shape[1],
