@@ -72,7 +72,7 @@ def pack(study: Study, out: Path, home: Path, *, values_only: bool = False) -> P
         values_only: leave policies and checkpoints behind.
 
     Raises:
-        StoreError: nothing to pack, something is in the way, or the disk is full. Nothing is left behind then.
+        StoreError: nothing to pack, an environment error, or the disk is full. Nothing is left behind then.
     """
     from pipelines.tracking.mlflow_tracker import open_existing
 
@@ -191,7 +191,7 @@ def unpack(bundle: Path, home: Path) -> Taken:
         home: the work folder.
 
     Raises:
-        StoreError: it is no bundle, or a damaged one; or something is in the way here.
+        StoreError: it is no bundle, or a damaged one; or an environment error here.
     """
     place = Home(home)
     try:

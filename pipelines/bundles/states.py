@@ -82,7 +82,7 @@ def _loaded(name: str, file: Path) -> dict[str, Any]:
         state = load_whole(file)
     except BundleError:
         raise
-    except Exception as error:  # whatever is in the way: nothing is deleted, and nothing taken in
+    except Exception as error:  # any error: nothing is deleted, and nothing taken in
         raise BundleError(f"{name}: not a checkpoint that can be read ({one_line(error)})") from error
     if not isinstance(state, dict):
         raise BundleError(f"{name}: readable, but not a checkpoint of a run")

@@ -29,7 +29,7 @@ from pipelines.workspace.work_folder import StoreError, one_line
 KNOCK = 5.0  # seconds to wait for a cluster to answer
 PULSE, MISSES = 8.0, 3  # seconds between two looks at the head, and how many in a row may find nobody
 CODE = "RHMC_CODE"  # a variable that tells workers the driver's fingerprint
-GONE = 2  # exit code where the head is: something is in the way
+GONE = 2  # exit code where the head is: environment error
 ANSWER = 90.0  # seconds to wait for a node to look around: it may start a process and import torch
 DEATHS = 3  # workers that may die in a row on one training without getting it further
 NODE_DIED = "its node has died"  # in what Ray says of an actor

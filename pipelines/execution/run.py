@@ -46,7 +46,7 @@ def run_studies(studies: Sequence[Study], home: Path) -> int:
         home: the work folder.
 
     Returns:
-        0 all finished, 1 some run failed, 2 something is in the way, 130 interrupted, 143 terminated. A second launch
+        0 all finished, 1 some run failed, 2 environment error, 130 interrupted, 143 terminated. A second launch
         is always safe.
 
     Raises:
@@ -84,7 +84,7 @@ def _apart(studies: Sequence[Study]) -> Iterator[str]:
 
 
 def guarded(home: Path, names: Sequence[tuple[str, str]], launch: Callable[[Home, "Interrupts"], int]) -> int:
-    """Hold studies or a search while they are launched; what is in the way becomes one line and an exit code.
+    """Hold studies or a search while they are launched; an environment error becomes one line and an exit code.
 
     Args:
         home: the work folder.
@@ -323,7 +323,7 @@ def show_status(study: Study, home: Path, *, as_json: bool = False) -> int:
     """Print how far a study is: per arm the runs finished, under way, failed (and why), missing, and stale (and why).
 
     Returns:
-        0 all finished, 1 not, 2 something is in the way.
+        0 all finished, 1 not, 2 environment error.
     """
     try:
         found = _status(study, Home(home))

@@ -58,8 +58,8 @@ def export_study(study: Study, out: Path, home: Path | None = None) -> int:
         home: work folder, see `work_folder`.
 
     Returns:
-        0 all planned runs are there and finished, 1 some are not (the files are written all the same), 2 something is
-        in the way.
+        0 all planned runs are there and finished, 1 some are not (the files are written all the same), 2 environment
+        error.
     """
     from pipelines.tracking.mlflow_tracker import open_existing
 

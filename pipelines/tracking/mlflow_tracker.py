@@ -626,7 +626,7 @@ def _recorded(ref: str, status: str, tags: Mapping[str, str]) -> Recorded:
     )
 
 
-# What may be in the way
+# Environment errors
 
 
 # MLflow makes the folders of a SQLite address as it is written, with %20 for a space. Ours are there.

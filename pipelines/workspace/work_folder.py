@@ -27,7 +27,7 @@ OUT_OF_IT = errno.EINVAL  # what seeking to before the start of a file gives
 
 
 class StoreError(InputError):
-    """Something outside the program is in the way; str() is the whole message, one line, without passwords."""
+    """Environment error, from outside the program; str() is the whole message, one line, without passwords."""
 
     def __init__(self, text: str) -> None:
         super().__init__(scrubbed(text))

@@ -404,7 +404,7 @@ def test_a_run_that_diverges_looks_failed_everywhere(
     assert line in capsys.readouterr().out.splitlines()
 
 
-# What may be in the way
+# Environment errors
 
 
 def test_a_second_driver_is_refused(home: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -364,7 +364,7 @@ def test_where_the_log_lies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert mlflow_tracker.tracking_uri(Home(tmp_path)) == "http://tracking:5000"
 
 
-# What may be in the way: one line that names it
+# Environment errors: one line that names them
 
 
 def refused(home: Path) -> str:

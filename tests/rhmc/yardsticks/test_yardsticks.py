@@ -60,7 +60,7 @@ def settled(cfg: coverage.Config, state: coverage.State, policy: Any, steps: int
 
 
 def sets_in_view(state: coverage.State, b: int, i: int) -> set[frozenset[int]]:
-    """Targets that sensor i of row b sees under headings all round: each degree, and just before one enters or leaves."""
+    """Targets that sensor i of row b sees under all headings: each degree, and just before one enters or leaves."""
     world = oracle.World(
         [(float(x), float(y)) for x, y in state.sensors[b]],
         [0.0] * state.sensors.shape[1],
