@@ -21,11 +21,10 @@ from typing import Any, NamedTuple
 
 from filelock import FileLock
 
-from pipelines.specs import safe_names as names
-from pipelines.tracking import arm_colours as legend
-from pipelines.tracking import saved_views as views
+from pipelines.specs import safe_names
+from pipelines.tracking import arm_colours, saved_views
 from pipelines.tracking.tracker import ADOPTED, VALUES_ONLY, Card, Recorded, Row, Status, StudyCard, unseen
-from pipelines.workspace import relocation as moved
+from pipelines.workspace import relocation
 from pipelines.workspace.addresses import fault, scrubbed, without_password
 from pipelines.workspace.best_effort import decoration
 from pipelines.workspace.errors import InputError
@@ -101,7 +100,7 @@ class MlflowTracker:
     def __init__(self, study: StudyCard, home: Home, *, write: bool = True) -> None:
         self.study, self.home, self.uri = study, home, tracking_uri(home)
         self.remarks: list[str] = []  # what a person should know of this launch
-        self.own = moved.is_own(self.uri, home)
+        self.own = relocation.is_own(self.uri, home)
         with explained(self.uri):
             self.client = (writer if write else reader)(self.uri, home)
             self.experiment = self._experiment(home, write)
@@ -146,12 +145,12 @@ class MlflowTracker:
     def _look(arm: str, arms: Sequence[str]) -> list[tuple[str, str]]:
         """Tags that say how the runs of an arm are shown."""
         if arm not in arms:
-            return [(legend.TAG, arm)]
+            return [(arm_colours.TAG, arm)]
         place = arms.index(arm)
         try:
-            return [(legend.TAG, legend.legend(arm, place)), (legend.COLOUR, legend.colour(place))]
+            return [(arm_colours.TAG, arm_colours.legend(arm, place)), (arm_colours.COLOUR, arm_colours.colour(place))]
         except Exception:  # a colour never ends a launch; without one MLflow picks it
-            return [(legend.TAG, arm)]
+            return [(arm_colours.TAG, arm)]
 
     def _parent(self) -> str:
         ref = self._only("tags.role = 'study'", self.study.study, {"role": PARENT}).info.run_id
@@ -160,8 +159,8 @@ class MlflowTracker:
             self._describe(ref, self.study.note)
         with decoration(f"{self.study.study}: saved views in the log", _note):
             experiment = self.client.get_experiment(self.experiment)
-            legends = [dict(self._look(arm, self.arms))[legend.TAG] for arm in self.study.arms]
-            save_views(self.client, experiment, views.views(self.study.params, legends))
+            legends = [dict(self._look(arm, self.arms))[arm_colours.TAG] for arm in self.study.arms]
+            save_views(self.client, experiment, saved_views.views(self.study.params, legends))
         self.client.update_run(ref, "RUNNING")
         return ref
 
@@ -169,7 +168,7 @@ class MlflowTracker:
         """Show the note, with the saved views in its first paragraph: all that MLflow shows of it unasked."""
         assert self.experiment is not None
         first, gap, rest = note.partition("\n\n")
-        note = fitting(f"{first} {views.links(self.experiment)}{gap}{rest}")
+        note = fitting(f"{first} {saved_views.links(self.experiment)}{gap}{rest}")
         self.client.set_experiment_tag(self.experiment, NOTE, note)
         self.client.set_tag(ref, NOTE, note)
 
@@ -258,9 +257,9 @@ class MlflowTracker:
         """See `Tracker`."""
         with explained(self.uri):
             if stale:
-                self.client.set_tag(ref, views.STALE, "yes")
+                self.client.set_tag(ref, saved_views.STALE, "yes")
             else:
-                self.client.delete_tag(ref, views.STALE)
+                self.client.delete_tag(ref, saved_views.STALE)
 
     def start(self, card: Card) -> "MlflowRun":
         """See `Tracker`."""
@@ -318,7 +317,7 @@ class MlflowTracker:
 
         first: dict[tuple[str, int, str], float] = {}
         for one in Histories(self.client, self.uri).of(self._runs(refs), keys_of(metrics)):
-            first.setdefault((one.ref, one.step, names.full(one.metric)), one.value)
+            first.setdefault((one.ref, one.step, safe_names.full(one.metric)), one.value)
         return (Row(*place, value) for place, value in first.items())
 
     def _runs(self, refs: Sequence[str]) -> Iterator[Run]:
@@ -335,7 +334,7 @@ class MlflowTracker:
             for ref in refs:
                 first: dict[tuple[int, str], float] = {}
                 for step, key, value, is_nan in database.execute(query, (ref, *keys)).fetchall():  # let writers in
-                    first.setdefault((step, names.full(key)), float("nan") if is_nan else value)
+                    first.setdefault((step, safe_names.full(key)), float("nan") if is_nan else value)
                 yield from (Row(ref, *place, value) for place, value in first.items())
 
     def publish(self, note: str, files: Mapping[str, bytes]) -> None:
@@ -370,12 +369,12 @@ class MlflowTracker:
         """The place where the files of a run are looked for."""
         with explained(self.uri):
             stored = self.client.get_run(ref).info.artifact_uri
-            return str(moved.run_folder(stored, self.home, own=self.own) or stored)
+            return str(relocation.run_folder(stored, self.home, own=self.own) or stored)
 
     def keeps(self, ref: str) -> ArtifactRepository:
         """The files of a run, where they are now."""
         stored = self.client.get_run(ref).info.artifact_uri
-        there = moved.run_folder(stored, self.home, own=self.own)
+        there = relocation.run_folder(stored, self.home, own=self.own)
         return get_artifact_repository(there.as_uri() if there else stored, tracking_uri=self.uri)
 
     def where(self) -> str:
@@ -398,7 +397,9 @@ class MlflowRun:
     def log(self, points: Sequence[Metrics]) -> None:
         """See `RunLog`."""
         now = int(time.time() * 1000)
-        values = [Metric(names.shown(metric), value, now, step) for metric, step, value in unseen(points, self.seen)]
+        values = [
+            Metric(safe_names.shown(metric), value, now, step) for metric, step, value in unseen(points, self.seen)
+        ]
         with explained(self.uri):
             for start in range(0, len(values), BATCH):
                 self.client.log_batch(self.ref, metrics=values[start : start + BATCH])
@@ -445,7 +446,7 @@ class MlflowRun:
         Where a server keeps the files, that is its business.
         """
         tracker = self.tracker
-        folder = moved.run_folder(self.client.get_run(self.ref).info.artifact_uri, tracker.home, own=tracker.own)
+        folder = relocation.run_folder(self.client.get_run(self.ref).info.artifact_uri, tracker.home, own=tracker.own)
         if folder and folder.is_dir():
             for path in (*folder.rglob("*"), folder, *list(folder.parents)[:3]):
                 sync(path)
@@ -463,7 +464,7 @@ def fitting(note: str) -> str:
 
 def keys_of(metrics: Collection[str] | None) -> set[str] | None:
     """The names that metrics of the program may have in MLflow; None for all."""
-    return None if metrics is None else {name for metric in metrics for name in (metric, names.shown(metric))}
+    return None if metrics is None else {name for metric in metrics for name in (metric, safe_names.shown(metric))}
 
 
 def addresses(uri: str, server: str) -> list[tuple[str, str, str]]:
@@ -484,8 +485,8 @@ def addresses(uri: str, server: str) -> list[tuple[str, str, str]]:
     return [(e.name, view.name, f"{server}/#/experiments/{e.experiment_id}/runs?{view.query}") for e, view in found]
 
 
-def _views_of(client: MlflowClient, experiment: Experiment) -> list[views.View]:
-    there = views.views({})
+def _views_of(client: MlflowClient, experiment: Experiment) -> list[saved_views.View]:
+    there = saved_views.views({})
     if all(view.tag in experiment.tags for view in there):
         return there
     runs = client.search_runs([experiment.experiment_id], "tags.role = 'run'", max_results=100)
@@ -493,12 +494,12 @@ def _views_of(client: MlflowClient, experiment: Experiment) -> list[views.View]:
     for run in runs:
         mine = params[run.data.params.get("method", "")]
         mine += [name for name in run.data.params if name not in (*mine, "method")]
-    wanted = views.views(params)
+    wanted = saved_views.views(params)
     save_views(client, experiment, wanted)
     return wanted
 
 
-def save_views(client: MlflowClient, experiment: Experiment, wanted: Sequence[views.View]) -> None:
+def save_views(client: MlflowClient, experiment: Experiment, wanted: Sequence[saved_views.View]) -> None:
     """Write the saved views of an experiment where they are not as they should be."""
     for view in wanted:
         written = view.written(experiment.creation_time or 0)
@@ -581,7 +582,7 @@ def prepared(home: Home) -> str:
     quieten()
     with explained(uri):
         if not (uri.startswith("sqlite:") and sqlite_file(uri).stat().st_size == 0):
-            moved.bring_up_to_date(uri, home)
+            relocation.bring_up_to_date(uri, home)
     return uri
 
 
@@ -591,7 +592,7 @@ def writer(uri: str, home: Home) -> MlflowClient:
     quieten()
     if uri.startswith("sqlite:"):
         create_database(sqlite_file(uri))
-    moved.bring_up_to_date(uri, home)
+    relocation.bring_up_to_date(uri, home)
     return MlflowClient(uri, uri)
 
 
@@ -618,7 +619,7 @@ def reader(uri: str, home: Home) -> MlflowClient:
 def _recorded(ref: str, status: str, tags: Mapping[str, str]) -> Recorded:
     known: dict[str, str] = defaultdict(str, tags)
     key = f"{known['spec']}-{known['fingerprint']}"
-    stale, host = views.STALE in tags, Host(known["machine"], known["versions"])
+    stale, host = saved_views.STALE in tags, Host(known["machine"], known["versions"])
     modules: Mapping[str, str] = json.loads(known[MODULES] or "{}")
     return Recorded(
         *(ref, known[ARM], key, FROM_MLFLOW[status], known["commit"], stale, host, known["error"]),

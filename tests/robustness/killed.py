@@ -31,8 +31,7 @@ from pipelines.specs.search import Search
 from pipelines.tracking import mlflow_tracker, registry
 from pipelines.tracking.plan import Commit, study_card
 from pipelines.tracking.tracker import StudyCard
-from pipelines.tuning import ray_workers as pool
-from pipelines.tuning import search_run, trials
+from pipelines.tuning import ray_workers, search_run, trials
 from pipelines.tuning.ray_workers import Failed, TrialJob, Worker
 from reports.pages import build
 from tests.pipelines.support import setting, tiny
@@ -229,7 +228,7 @@ def _act(number: int, home: str, packed: str, length: int, count: str) -> None:
         module.read_commit = lambda: Commit("c0ffee")  # type: ignore[attr-defined]  # the code may be worked on meanwhile
     ray_driver.ray_session = lambda *args: nullcontext([])  # type: ignore[assignment,return-value]
     ray_driver.fit = fit_here  # type: ignore[assignment]
-    pool.Pool = PoolHere  # type: ignore[assignment,misc]
+    ray_workers.Pool = PoolHere  # type: ignore[assignment,misc]
     fuse = Fuse(length)
     VERBS[number].between(fuse)
     fuse.lay(home)

@@ -31,7 +31,7 @@ from pipelines.specs.study import RunSpec, Study
 from pipelines.tracking.mlflow_tracker import MlflowTracker, open_existing
 from pipelines.tracking.plan import items, study_card
 from pipelines.tracking.policy import SPEC, load
-from pipelines.workspace import leftovers as litter
+from pipelines.workspace import leftovers
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.work_folder import Checkpoints, Home, StoreError, load_whole, save_atomically, without_replay
 from rhmc.training.trainer import Config, Trainer, grid_step
@@ -1031,7 +1031,7 @@ def test_a_disk_that_is_full_at_first(good: Path, tmp_path: Path, template: Path
 
 
 def test_what_killed_processes_left_is_swept(here: Path, good: Path, there: Path, tmp_path: Path) -> None:
-    gone = f"{litter.HOST}-4194305"
+    gone = f"{leftovers.HOST}-4194305"
     late = items(STUDY)[2]
     unfinished = [there / f"import.{gone}.part", tmp_path / f"b.zip.{gone}.part", tmp_path / f"b.zip.files.{gone}.part"]
     kept = [tmp_path / f"b.zip.elsewhere-{1}.part", tmp_path / f"other.zip.{gone}.part"]

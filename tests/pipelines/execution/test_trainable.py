@@ -20,7 +20,7 @@ from pipelines.execution.cluster import here
 from pipelines.execution.finite import DivergedError, check, defined
 from pipelines.execution.seed_group import Seeds
 from pipelines.execution.trainable import RunTrainable
-from pipelines.workspace import work_folder as store
+from pipelines.workspace import work_folder
 from pipelines.workspace.work_folder import (
     Checkpoints,
     DamagedError,
@@ -402,7 +402,7 @@ def test_what_has_no_value_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_file_is_durable_before_its_name_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[tuple[str, bool]] = []
-    monkeypatch.setattr(store, "sync", lambda path: seen.append((path.name, (tmp_path / "x.pt").exists())))
+    monkeypatch.setattr(work_folder, "sync", lambda path: seen.append((path.name, (tmp_path / "x.pt").exists())))
     save_atomically(tmp_path / "x.pt", 1)
     assert [(name.split(".")[-1], there) for name, there in seen] == [("part", False), (tmp_path.name, True)]
 
@@ -556,4 +556,4 @@ def test_no_checkpoint_is_no_state(tmp_path: Path) -> None:
     ],
 )
 def test_an_error_in_one_line(text: str, line: str) -> None:
-    assert store.one_line(ValueError(text)) == line
+    assert work_folder.one_line(ValueError(text)) == line

@@ -32,7 +32,7 @@ from pipelines.specs.search import EVAL_SEED, FIRST_SEED, Dimension, Search
 from pipelines.specs.study import Setting, Study, StudyError
 from pipelines.tracking.mlflow_tracker import open_existing
 from pipelines.tracking.tracker import MemoryRun, MemoryTracker, points_of
-from pipelines.tuning import ray_workers as pool
+from pipelines.tuning import ray_workers
 from pipelines.tuning.best_params import file_name, winner_yaml
 from pipelines.tuning.ray_workers import Failed
 from pipelines.tuning.search_plots import plots
@@ -789,7 +789,7 @@ def test_a_killed_and_interrupted_search_ends_as_one_that_was_not(
     shutil.copy(home / "mlflow.db", project / "template.db")
     with pytest.MonkeyPatch.context() as alone:  # without Ray: a worker takes seconds to start, and changes nothing
         alone.setattr(ray_driver, "ray_session", lambda *args: nullcontext([]))
-        alone.setattr(pool, "Pool", PoolHere)
+        alone.setattr(ray_workers, "Pool", PoolHere)
         assert run_search(search, fresh(project, "whole"), project / "whole" / "out") == 0
     capsys.readouterr()
 
