@@ -1,4 +1,4 @@
-"""What limits a policy that acts on what it sees at once: how well networks copy the 30-step planner. Prints Markdown.
+"""The limit of policies without memory, as the accuracy with which networks copy the 30-step planner. Prints Markdown.
 
 Coverage `flat`, 4 x 5, `extended` observation, pairwise encoder. The planner names the action in every state that the
 network's own play visits (DAgger, Ross et al. 2011; the planner acts in a falling share of the first 50 k steps), the
@@ -17,8 +17,8 @@ from rhmc.envs import coverage, make_env
 from rhmc.learning.learner import Learner, pack, unpack
 from rhmc.learning.schedules import linear
 from rhmc.networks.nets import ENCODERS, Sizes
-from rhmc.scripted.coverage import planner
 from rhmc.types import Batch, Obs
+from rhmc.yardsticks.coverage import planner
 
 CFG = coverage.Config(observation="extended")
 COPIES, KEPT, ROWS = 128, 1500, 2  # environments, steps kept, steps of an update

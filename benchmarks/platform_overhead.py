@@ -1,4 +1,4 @@
-"""What Ray, MLflow and checkpoints cost: the same trainings in a bare loop and through `rhmc study run`.
+"""The cost of Ray, MLflow and checkpoints: the same trainings in a bare loop and through `rhmc study run`.
 
 Bare: a loop over `rhmc.training.trainer.Trainer` in plain processes, two at a time; no Ray, no log, no checkpoint. Both
 sides train the arms `full` and `no filter` of studies/ablation.yaml with two seeds each, bare and platform in turn, and
@@ -205,14 +205,14 @@ def platform(changes: list[str], out: Path) -> None:
 
 
 def changes(minutes: float) -> list[str]:
-    """What makes the study one of four runs and so long."""
+    """The overrides that make the study one of four runs of this length."""
     steps = round(60 * minutes / RUNS * RATE)
     profile = "profiles.quick.trainer={final_lr_fraction: 0.05, evaluations: 20, eval_episodes: 100}"  # and not quick's
     return ["profiles.quick.arms=[full, no filter]", profile, f"seeds={RUNS // 2}", f"steps={steps}"]
 
 
 def command(changes: list[str]) -> list[str]:
-    """What launches it, after `rhmc`."""
+    """The arguments that launch it, after `rhmc`."""
     return ["study", "run", str(STUDY), *(word for text in changes for word in ("--set", text))]
 
 
@@ -367,7 +367,7 @@ def together(minutes: float) -> str:
 
 
 def verdict(accounts: dict[str, list[Account]]) -> str:
-    """What the platform takes more than the loop, at the median, and whether both learned the same."""
+    """The extra cost of the platform over the loop, at the median, and a check that both learned the same."""
     spent = {side: median(a.over_cpu for a in several) for side, several in accounts.items() if several}
     texts = [f"{side}: {share:.1%} of training's processor seconds" for side, share in spent.items()]
     if len(spent) == 2:

@@ -1,4 +1,4 @@
-"""What 1,000 and 10,000 queued runs cost the driver, the commands and MLflow's pages. Prints Markdown.
+"""The cost of 1,000 and 10,000 queued runs for the driver, the commands and MLflow's pages. Prints Markdown.
 
 Trials are simulated: a worker makes its points up and ends with the untrained policy of a small team. The driver is the
 real one (plan, recorder, log, registry, Ray). Of a study, a first launch finishes some runs and is interrupted; all
@@ -75,7 +75,7 @@ class MadeUp:
 
     @property
     def done(self) -> bool:
-        """Whether the last point is there."""
+        """True if the last point is there."""
         return self.point >= self.real.cfg.evaluations
 
     def __next__(self) -> Metrics:
@@ -97,7 +97,7 @@ class Simulated(RunTrainable):
     """A worker that trains nothing. Ray gets it by value."""
 
     def make_trainer(self) -> Any:
-        """What makes the points up."""
+        """The generator of the made-up points."""
         return MadeUp(RunSpec.model_validate_json(self.job["spec"]))
 
 
@@ -173,7 +173,7 @@ def fill(file: Path, home: Path, leave: int) -> int:
         copies = {table: Rows(database, table, model) for table in ("runs", "tags", "params", *METRICS)}
         for i, item in enumerate(todo[: len(todo) - leave]):
             card, ref, better = item.card, f"{i:032x}", random.Random(i).random()
-            about = {"variant": card.arm, "seed": str(card.seed), "spec": card.spec_id, "mlflow.runName": card.name}
+            about = {"arm": card.arm, "seed": str(card.seed), "spec": card.spec_id, "mlflow.runName": card.name}
             copies["runs"].write({"run_uuid": ref, "name": card.name}, {})
             copies["tags"].write({"run_uuid": ref}, about)
             copies["params"].write({"run_uuid": ref}, card.params)
@@ -210,7 +210,7 @@ class Rows:
 
 
 class Cost(NamedTuple):
-    """What a process took."""
+    """The resources that a process took."""
 
     wall: float  # seconds
     cpu: float  # seconds
@@ -293,7 +293,7 @@ def ask(url: str, body: dict[str, Any] | None = None) -> tuple[float, float, Any
 
 
 def pages(home: Path) -> Iterator[tuple[str, float, float]]:
-    """What MLflow's pages ask for: seconds and MiB of each answer."""
+    """The requests of MLflow's pages: seconds and MiB of each answer."""
     with server(home) as (address, memory):
         api = f"{address}/ajax-api/2.0/mlflow"
         *cost, found = ask(f"{api}/experiments/search?max_results=25")
@@ -332,7 +332,7 @@ def seconds(cost: Cost) -> str:
 
 
 def of_launch(cost: Cost, name: str) -> Column:
-    """What a launch tells."""
+    """The output of a launch."""
     assert cost.report is not None
     report, column = cost.report, {f"{name}: whole": seconds(cost)}
     wall, cpu = report["marks"]["first trial"]

@@ -14,6 +14,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from pipelines.export.tables import RUNS as EXPORTED
+from pipelines.export.tables import write_parquet
 from reports.data.frame import OWN, PLACE, POINTS, RUNS
 from reports.pages.build import build
 
@@ -50,7 +52,7 @@ def write(folder: Path, seeds: int, points: int) -> tuple[int, int]:
     for study in STUDIES:
         values, plan = tables(study, seeds, points, rng)
         values.to_parquet(folder / f"{study}.parquet", index=False)
-        plan[list(RUNS)].to_parquet(folder / f"{study}.runs.parquet", index=False)
+        write_parquet(folder / f"{study}.runs.parquet", EXPORTED, list(plan[EXPORTED.names].itertuples(index=False)))
         plan[[*PLACE, *OWN]].to_parquet(folder / f"{study}.made.parquet", index=False)
         runs, rows = runs + len(plan), rows + len(values)
     return runs, rows

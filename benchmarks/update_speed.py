@@ -1,4 +1,4 @@
-"""What one update of a network costs: by batch, optimiser, target network, torch.compile. Prints Markdown.
+"""The cost of one update of a network, by method: batch, optimiser, target network, torch.compile. Prints Markdown.
 
 The network is the executors' critic with the pairwise encoder on the coverage task's extended observation, the largest
 part of RHMC's training time. Milliseconds of processor time, one torch thread; forward and backward pass where an

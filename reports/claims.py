@@ -42,7 +42,7 @@ class UntestableError(Exception):
 
 
 class Finding(NamedTuple):
-    """What a rule returns. `ours`: the quantities it looked at, by name."""
+    """The result of a rule. `ours`: the quantities it looked at, by name."""
 
     verdict: Verdict
     reason: str
@@ -69,7 +69,7 @@ class Claim(NamedTuple):
 
     @property
     def provisional(self) -> bool:
-        """Whether the verdict rests on less than it should."""
+        """True if the verdict rests on less than it should."""
         return bool(self.caveats) and self.verdict in JUDGED
 
     @property
@@ -80,7 +80,7 @@ class Claim(NamedTuple):
 
 @dataclass
 class Evidence:
-    """What a rule may look at; it remembers which arms were used."""
+    """The runs that a rule may look at; it remembers which arms were used."""
 
     results: Results
     paper: Paper
@@ -135,7 +135,7 @@ class Evidence:
         return found
 
     def bound(self, policy: str) -> Interval | None:
-        """A scripted policy on the task of the coverage studies: mean and twice its standard error, if it was run."""
+        """A yardstick on the task of the coverage studies: mean and twice its standard error, if it was run."""
         self.asked.add(YARDSTICKS)
         for table in map(self.results.yardsticks_of, ("coverage", "ablation")):
             if policy in table.index and FINAL in table:
@@ -359,7 +359,7 @@ LISTED = ("coverage", "navigation")
 
 
 def _unstated(paper: Paper) -> Iterator[str]:
-    """What keeps the rules from being applied."""
+    """The reasons why rules cannot be applied."""
     for name in RULES:
         if name not in paper.claims:
             yield f"claims.{name}: missing; there is a rule for it"
@@ -440,7 +440,7 @@ def described(ours: Mapping[str, Interval]) -> list[tuple[str, str]]:
 
 
 def command(study: str, profile: str) -> str:
-    """What makes a study's numbers, and the report from them, again. The study is named as its table is."""
+    """The command that makes a study's numbers, and the report from them, again. The study is named as its table is."""
     report = f"rhmc report --profile {profile}"
     if study == THEOREM:
         return f"rhmc theorem --out results/{profile}/runs && {report}"
@@ -466,7 +466,7 @@ def _judge(name: str, rule: Rule, results: Results, paper: Paper) -> Claim:
 
 
 def _caveats(see: Evidence) -> list[str]:
-    """Why a verdict from these arms is provisional."""
+    """The reasons why a verdict from these arms is provisional."""
     out = []
     for study in sorted({study for study, _ in see.used}):
         theirs, ours = see.paper.steps.get(study), see.results.budget(study)
@@ -484,7 +484,7 @@ def _complete(results: Results, study: str, arm: str) -> bool:
 
 
 def _best(see: Evidence, study: str) -> Finding:
-    """Whether RHMC is above every other method of a study."""
+    """True if RHMC is above every other method of a study."""
     ours, (others, absent) = see.finals(study, "RHMC"), see.rivals(study)
     gaps = {f"RHMC − {arm}": difference(ours, see.finals(study, arm)) for arm in others}
     behind = [arm for arm, gap in zip(others, gaps.values(), strict=True) if not gap.above(0)]
@@ -548,7 +548,7 @@ def _first_step(mask: "pd.Series[bool]") -> float:
 
 
 def _show(name: str) -> Callable[[float], str]:
-    """How a quantity is written, by what its name says it is."""
+    """The format of a quantity, by what its name says it is."""
     return steps if "step" in name else percent if name.endswith("in %") else number
 
 

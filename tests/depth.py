@@ -1,4 +1,4 @@
-"""How far the random campaigns and properties go: `make test` takes some examples of each, `make deep` many."""
+"""The extent of random campaigns and properties: `make test` takes some examples of each, `make deep` many."""
 
 import os
 
@@ -6,5 +6,5 @@ DEEP = os.environ.get("DEEP") == "1"
 
 
 def often(some: int, many: int) -> int:
-    """How often something random is tried."""
+    """The number of random tries."""
     return many if DEEP else some

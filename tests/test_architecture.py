@@ -44,7 +44,7 @@ ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
         "types": (),
         "registry": (),
         "envs": ("types", "registry"),
-        "scripted": ("envs",),
+        "yardsticks": ("envs",),
         "networks": ("types",),
         "learning": ("types", "networks"),
         "hierarchy": ("types", "networks", "learning"),
@@ -209,7 +209,7 @@ def cycle(arrows: dict[str, set[str]]) -> list[str]:
 
 
 def unsaid(text: str) -> bool:
-    """Whether a room's docstring fails to say, in one sentence, what lives there and what does not."""
+    """True if a room's docstring fails to say, in one sentence, what lives there and what does not."""
     sentence = text.partition("\n\n")[0]
     return not re.fullmatch(r"[^.;]+; no[^.;]+\.", " ".join(sentence.split()))
 
@@ -304,12 +304,12 @@ def drawn(package: str) -> list[str]:
 
 
 def reached(table: Mapping[str, Iterable[str]], room: str) -> set[str]:
-    """What a room imports, directly or not."""
+    """The rooms that a room imports, directly or not."""
     return {far for near in table[room] for far in (near, *reached(table, near))}
 
 
 def house() -> str:
-    """What `docs/architecture.md` says of the rooms: the drawing, and a sentence for each."""
+    """The text of `docs/architecture.md` on the rooms: the drawing, and a sentence for each."""
     lines = ["```mermaid", "graph BT", *(line for package in ROOMS for line in drawn(package))]
     lines += ["  pipelines --> rhmc", "  pipelines --> reports", "```", ""]
     for package, table in ROOMS.items():
@@ -337,7 +337,7 @@ def test_an_arrow_that_follows_from_others_is_not_drawn(monkeypatch: pytest.Monk
 
 
 def missing(stop: str) -> bool:
-    """Whether no `module:name` is there."""
+    """True if no `module:name` is there."""
     module, _, name = stop.partition(":")
     try:
         attrgetter(name)(import_module(module))
@@ -459,7 +459,7 @@ def test_a_method_is_a_page(page: Path) -> None:
 
 
 def unstated(page: str) -> list[str]:
-    """What the opening of a method's page does not say: where it is from, and where it departs from that."""
+    """The omissions in the opening of a method's page: where it is from, and where it departs from that."""
     text = ast.get_docstring(ast.parse(page)) or ""
     parts = {name: re.search(rf"^{name}\b[^:]*: *\S", text, re.MULTILINE) for name in ("Source", "Departures")}
     return [name for name, found in parts.items() if not found]
@@ -499,7 +499,7 @@ FOR_COPYING = "template"  # answers no question of the report
 
 
 def test_every_study_is_in_the_pipeline(stages: dict) -> None:
-    """A search is run by hand: what it finds is kept in `studies/found`, and a study that includes it is here."""
+    """A search is run by hand: what it finds is kept in `studies/best_params`, and a study that includes it is here."""
     studies = {p.stem for p in (ROOT / "studies").glob("*.yaml") if not is_search(p)} - {FOR_COPYING}
     stage, queue = stages["studies"], stages["vars"]["queue"].split()
     check, *commands = stage["cmd"]
@@ -533,7 +533,7 @@ def test_the_quick_profile_stays_quick(stages: dict) -> None:
 
 
 def is_search(path: Path) -> bool:
-    """Whether the file is named as a search; the contents have to agree."""
+    """True if the file is named as a search; the contents have to agree."""
     document = YAML(typ="safe").load(path.read_text(encoding="utf-8"))
     spaces = ["space" in (arm or {}) for arm in document.get("arms", {}).values()]
     assert spaces == [path.stem.startswith("search_")] * len(spaces), path

@@ -46,7 +46,7 @@ def following(source: bytes) -> Iterator[ast.Call]:
 
 
 def _opens(call: ast.Call, given: dict[str | None, ast.expr]) -> bool:
-    """Whether it reads or writes a file as text."""
+    """True if it reads or writes a file as text."""
     if isinstance(call.func, ast.Attribute):
         return call.func.attr in TEXT and not _binary(call, given) and not _of(call, "os", "zipfile")
     return getattr(call.func, "id", "") == "open" and not _binary(call, given)
@@ -58,6 +58,6 @@ def _binary(call: ast.Call, given: dict[str | None, ast.expr]) -> bool:
 
 
 def _of(call: ast.Call, *modules: str) -> bool:
-    """Whether it is the `open` of one of these modules, which is of bytes."""
+    """True if it is the `open` of one of these modules, which is of bytes."""
     owner = call.func.value if isinstance(call.func, ast.Attribute) and call.func.attr == "open" else None
     return isinstance(owner, ast.Name) and owner.id in modules

@@ -75,7 +75,7 @@ def observe(cfg: Config, state: State) -> Obs:
 
 
 def options(cfg: Config, state: State, horizon: int) -> Tensor:
-    """What each agent would face after each turn of up to `horizon`: (B, N, 2 horizon + 1, M) bool."""
+    """The targets that each agent would face after each turn of up to `horizon`: (B, N, 2 horizon + 1, M) bool."""
     turns = torch.arange(-horizon, horizon + 1).view(1, 1, -1, 1)
     return (state.bearing.unsqueeze(2) - turns) % HEADINGS == 0
 

@@ -40,7 +40,7 @@ LINE = 400  # characters of a fault
 
 
 class Packed(NamedTuple):
-    """What went into a bundle, in runs."""
+    """The runs that went into a bundle."""
 
     planned: int
     finished: int
@@ -49,7 +49,7 @@ class Packed(NamedTuple):
 
 
 class Taken(NamedTuple):
-    """What came of a bundle, in runs; `foreign` of them were made by code that is not the code here."""
+    """The runs that came out of a bundle; `foreign` of them were made by code that is not the code here."""
 
     study: str
     profile: str
@@ -72,7 +72,7 @@ def pack(study: Study, out: Path, home: Path, *, values_only: bool = False) -> P
         values_only: leave policies and checkpoints behind.
 
     Raises:
-        StoreError: nothing to pack, something is in the way, or the disk is full. Nothing is left behind then.
+        StoreError: nothing to pack, an environment error, or the disk is full. Nothing is left behind then.
     """
     from pipelines.tracking.mlflow_tracker import open_existing
 
@@ -113,7 +113,7 @@ def _beside(part: Path, out: Path) -> Iterator[Path]:
 
 
 def _check_packed(folder: Path, out: Path) -> None:
-    """What import would refuse is not written: better known here than there."""
+    """Refuse to write a bundle that import would refuse: better known here than there."""
     try:
         with opened(folder) as files:
             read(files)
@@ -191,7 +191,7 @@ def unpack(bundle: Path, home: Path) -> Taken:
         home: the work folder.
 
     Raises:
-        StoreError: it is no bundle, or a damaged one; or something is in the way here.
+        StoreError: it is no bundle, or a damaged one; or an environment error here.
     """
     place = Home(home)
     try:
@@ -246,7 +246,7 @@ def _take_in(told: Told, study: StudyCard, home: Home, stock: Stock) -> Taken:
                 _log(tracker, study, entry, stock, told.about.adopted.get(entry.key, ""))
             for entry in begun:
                 _lay_out(tracker, there.get(entry.place), home, entry, stock)
-            complete = told.plan is not None and told.plan <= finished(tracker.recorded())
+            complete = told.plan <= finished(tracker.recorded())
         finally:
             tracker.close("finished" if complete else "interrupted")
     here = present()
@@ -273,7 +273,7 @@ def _log(tracker: Tracker, study: StudyCard, entry: Entry, stock: Stock, adopted
 
 
 def _goes_further(entry: Entry, home: Home, files: Files) -> bool:
-    """Whether a run under way has got further in the bundle than here."""
+    """True if a run under way has got further in the bundle than here."""
     if entry.finished:
         return False
     newest = states_of(files, entry)[-1]

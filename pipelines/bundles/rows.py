@@ -1,4 +1,4 @@
-"""What a bundle says of its study and its runs, and their values: one strict model, checked as a whole."""
+"""The statements of a bundle on its study, its runs and their values: one strict model, checked as a whole."""
 
 import hashlib
 import json
@@ -26,8 +26,7 @@ from rhmc.algorithms import ALGORITHMS
 from rhmc.training.trainer import Config, grid_step, misfit
 from rhmc.types import Frozen, Metrics
 
-FORMAT = 3
-READ = (2, FORMAT)  # an earlier one does not say which runs its study has
+FORMAT = 4
 RUNS = pa.schema(
     [
         ("key", pa.string()),  # spec id and fingerprint
@@ -41,6 +40,7 @@ RUNS = pa.schema(
     ]
 )
 POINTS = pa.schema([("run", pa.int64()), ("step", pa.int64()), ("metric", pa.string()), ("value", pa.float64())])
+ANEW = "train its study anew with `rhmc study run`"
 ROWS = {bundle_files.RUNS: 10_000, bundle_files.POINTS: 5_000_000}  # that are read at most
 UNFOLDED = 2**26  # characters in a column of texts, each as often as it occurs
 DECODED = 2**29  # bytes of a table in memory
@@ -71,7 +71,7 @@ def _text_fault(text: str) -> str:
 
 
 def metric_fault(metric: str) -> str:
-    """What is wrong with the name of a metric, or nothing."""
+    """The fault of the name of a metric, or nothing."""
     kind = next((group for group in GROUPS if metric.startswith(group)), "")
     plain = metric.removeprefix(kind).replace("_", "").replace(".", "").replace("-", "")
     if kind and plain.isascii() and plain.isalnum() and len(metric) <= 200:
@@ -94,15 +94,14 @@ Metric = Annotated[str, AfterValidator(partial(_sound, metric_fault))]
 
 
 class Manifest(Frozen):
-    """What a bundle says of itself."""
+    """The statements of a bundle on itself."""
 
-    format: Literal[2, 3]
+    format: Literal[4]
     study: StudyName
     profile: ProfileName
     note: Text
     params: dict[Method, tuple[Setting, ...]]
     arms: tuple[Arm, ...] = Field(min_length=1)
-    fingerprint: Digest | None = None  # of all the code, in format 2: later a run's key has that of its own
     commit: Commit
     plan: tuple[tuple[Arm, Key], ...] = ()  # every run of the study, in the bundle or not
     code: dict[Digest, dict[Module, Digest]] = Field(default_factory=dict)  # the modules of each code that made a run
@@ -112,10 +111,8 @@ class Manifest(Frozen):
     def _whole(self) -> "Manifest":
         if len(set(self.arms)) < len(self.arms):
             raise ValueError("arms: one of them is there twice")
-        if bool(self.plan) != (self.format == FORMAT):
-            raise ValueError(f"plan: must name the runs of the study, in format {FORMAT} alone")
-        if (self.fingerprint is None) != (self.format == FORMAT):
-            raise ValueError(f"fingerprint: must be there in formats before {FORMAT} alone")
+        if not self.plan:
+            raise ValueError("plan: must name the runs of the study")
         return self
 
 
@@ -157,7 +154,7 @@ class Entry(NamedTuple):
     finished: bool
     policy: str  # SHA-256 of its file, empty without one
     values: Values
-    key: str  # in the bundle, whose format may name runs otherwise
+    key: str  # in the bundle
 
     @property
     def place(self) -> tuple[str, str]:
@@ -166,7 +163,7 @@ class Entry(NamedTuple):
 
     @property
     def files(self) -> str:
-        """How the names of its files begin."""
+        """The beginning of the names of its files."""
         return f"policies/{self.key}.pt" if self.finished else f"checkpoints/{self.key}/"
 
 
@@ -177,20 +174,16 @@ class Told(NamedTuple):
     entries: list[Entry]
 
     @property
-    def plan(self) -> set[tuple[str, str]] | None:
-        """Arm and key of every run of the study; None where that cannot be known."""
-        if self.about.plan:
-            return set(self.about.plan)
-        seeds = {arm: {e.item.card.seed for e in self.entries if e.item.card.arm == arm} for arm in self.about.arms}
-        each = max(map(len, seeds.values()))
-        return {e.place for e in self.entries} if all(s == set(range(each)) for s in seeds.values()) else None
+    def plan(self) -> set[tuple[str, str]]:
+        """Arm and key of every run of the study."""
+        return set(self.about.plan)
 
 
 # Reading
 
 
 def read(files: Files) -> Told:
-    """What a bundle says, all of it checked but for the content of its policies and checkpoints.
+    """The statements of a bundle, all of it checked but for the content of its policies and checkpoints.
 
     Raises:
         BundleError: something is not as `pack` writes it.
@@ -209,8 +202,9 @@ def _manifest(files: Files) -> Manifest:
         form = json.loads(content).get("format")
     except (ValueError, AttributeError, RecursionError) as error:
         raise BundleError(f"{MANIFEST}: must be a mapping in JSON ({one_line(error)})") from error
-    if type(form) is int and form not in READ:
-        raise BundleError(f"a bundle of format {form}; this version reads {' and '.join(map(str, READ))}")
+    if type(form) is int and form != FORMAT:
+        age, remedy = ("a later", "import it with that version") if form > FORMAT else ("an older", ANEW)
+        raise BundleError(f"a bundle of format {form}, made by {age} version; this one reads format {FORMAT}: {remedy}")
     try:
         return Manifest.model_validate_json(content, strict=True)
     except ValidationError as error:
@@ -349,7 +343,7 @@ def _each(column: np.ndarray, name: str, fine: np.ndarray, rule: str) -> None:
 def _entry(about: Manifest, at: int, run: Run, values: Values) -> Entry:
     where = f"{bundle_files.RUNS}: row {at}"
     spec = _spec(where, run.config)
-    code = _code(where, about, run, spec)
+    code = _code(where, run, spec)
     if run.seed != spec.seed:
         raise BundleError(f"{where}: seed: {run.seed} is not allowed; of these settings it is {spec.seed}")
     if run.arm not in about.arms:
@@ -364,14 +358,10 @@ def _entry(about: Manifest, at: int, run: Run, values: Values) -> Entry:
     return entry
 
 
-def _code(where: str, about: Manifest, run: Run, spec: RunSpec) -> str:
+def _code(where: str, run: Run, spec: RunSpec) -> str:
     """The code that made a run, from its key, whose other part has to be that of its settings."""
     code = run.key.rpartition("-")[2]
-    if about.fingerprint is None:
-        key = f"{spec.id}-{code}"
-    else:  # it named settings by their whole text
-        key = f"{hashlib.sha256(run.config.encode()).hexdigest()[:12]}-{about.fingerprint}"
-    if run.key != key:
+    if run.key != (key := f"{spec.id}-{code}"):
         raise BundleError(f"{where}: key: {run.key} is not allowed; of these settings and this code it is {key}")
     return code
 
@@ -396,7 +386,7 @@ def _spec(where: str, config: str) -> RunSpec:
 
 
 def _within(part: Any, whole: Any) -> bool:
-    """Whether all that is given is there as it is given, so that nothing was read as something else."""
+    """True if all that is given is there as it is given, so that nothing was read as something else."""
     if isinstance(part, dict) and isinstance(whole, dict):
         return part.keys() <= whole.keys() and all(_within(value, whole[key]) for key, value in part.items())
     return type(part) is type(whole) and bool(part == whole)
@@ -441,7 +431,7 @@ def _check_curve(where: str, entry: Entry) -> None:
 
 
 def on_grid(cfg: Config, step: int) -> bool:
-    """Whether some point of a run's evaluation grid is at this step."""
+    """True if some point of a run's evaluation grid is at this step."""
     point = max(0, (step - cfg.num_envs) * cfg.evaluations // cfg.steps + 1)  # the first that may be as late
     return point <= cfg.evaluations and grid_step(cfg, point) == step
 
@@ -457,7 +447,7 @@ def _check_whole(about: Manifest, entries: Sequence[Entry], files: Files) -> Non
     """All runs of the plan, and their files without any other."""
     arms, plan = set(about.arms), set(about.plan)
     for at, entry in enumerate(entries):
-        if plan and entry.place not in plan:
+        if entry.place not in plan:
             name = show(entry.item.card.name)
             raise BundleError(f"{bundle_files.RUNS}: row {at}: {name} is not in the plan of {MANIFEST}")
     if unknown := [arm for arm, _ in about.plan if arm not in arms]:

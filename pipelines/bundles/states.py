@@ -82,7 +82,7 @@ def _loaded(name: str, file: Path) -> dict[str, Any]:
         state = load_whole(file)
     except BundleError:
         raise
-    except Exception as error:  # whatever is in the way: nothing is deleted, and nothing taken in
+    except Exception as error:  # any error: nothing is deleted, and nothing taken in
         raise BundleError(f"{name}: not a checkpoint that can be read ({one_line(error)})") from error
     if not isinstance(state, dict):
         raise BundleError(f"{name}: readable, but not a checkpoint of a run")
@@ -118,7 +118,7 @@ def _value_fault(value: Any) -> str:
 
 
 def _check_progress(name: str, point: str, state: dict[str, Any], entry: Entry) -> None:
-    """What a checkpoint says of how far it is."""
+    """The progress that a checkpoint states."""
     trainer, history, seconds = state.get("trainer"), state.get("history"), state.get("seconds")
     if not (isinstance(trainer, dict) and trainer.keys() == TRAINER and isinstance(history, list)):
         raise BundleError(f"{name}: not a checkpoint of a run under way; it has trainer, history and seconds")

@@ -1,4 +1,4 @@
-"""What may be wrong with an installation and its work folder: each check gives one line, with what to do."""
+"""Checks of an installation and its work folder: each check gives one line, with what to do."""
 
 import os
 import shutil
@@ -24,7 +24,7 @@ Level = Literal["ok", "note", "fault"]
 
 
 class Finding(NamedTuple):
-    """What a check found; a `note` is worth knowing and nothing is wrong."""
+    """The finding of a check; a `note` is worth knowing and nothing is wrong."""
 
     level: Level
     what: str
@@ -81,7 +81,7 @@ def required() -> Iterator[Requirement]:
 
 
 def torch_build() -> list[Finding]:
-    """Whether torch can compute here, and on what."""
+    """Check that torch can compute here, and on which devices."""
     try:
         import torch
 
@@ -98,7 +98,7 @@ def torch_build() -> list[Finding]:
 
 
 def arithmetic() -> list[Finding]:
-    """Whether torch's operations give the published bytes here."""
+    """Check that torch's operations give the published bytes here."""
     try:
         from pipelines.workspace.arithmetic import differing
 
@@ -112,7 +112,7 @@ def arithmetic() -> list[Finding]:
 
 
 def code(where: Path | None = None) -> list[Finding]:
-    """Whether the commit that runs are logged with can be read. where: a folder of the code; this one if None."""
+    """Check that the commit that runs are logged with can be read. where: a folder of the code; this one if None."""
     from pipelines.tracking.plan import read_commit
 
     found = read_commit(where) if where else read_commit()
@@ -135,7 +135,7 @@ def disk(home: Path, needed: int = NEEDED) -> list[Finding]:
 
 
 def store(home: Home) -> Iterator[Finding]:
-    """Whether the log can be read, and what in it waits or is of other code."""
+    """Check that the log can be read, and report what in it waits or is of other code."""
     from pipelines.tracking.mlflow_tracker import census, tracking_uri
 
     uri = tracking_uri(home)
@@ -175,7 +175,7 @@ def _places(count: Mapping[str, int]) -> str:
 
 
 def starts_ray(home: Path | None = None) -> list[Finding]:
-    """Whether Ray starts here, or its cluster answers and every node can train with this work folder."""
+    """Check that Ray starts here, or that its cluster answers and every node can train with this work folder."""
     from pipelines.execution.ray_settings import set_up_ray
 
     set_up_ray()

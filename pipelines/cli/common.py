@@ -1,4 +1,4 @@
-"""What the verbs share: options, reading a study, printing. Imports nothing heavy."""
+"""Parts that the verbs share: options, reading a study, printing. Imports nothing heavy."""
 
 import json
 import sys
@@ -112,7 +112,7 @@ def folder_option(out: Path | None) -> Iterator[None]:
 
 
 def profile_faults(profile: str) -> list[str]:
-    """What is wrong with `--profile`, for verbs that read no study."""
+    """The fault of `--profile`, for verbs that read no study."""
     from pipelines.specs.document import choices, show
 
     return [] if profile in PROFILES else [f"--profile: {show(profile)} is not allowed; {choices(profile, PROFILES)}"]

@@ -1,4 +1,4 @@
-"""Trained policies looked at again: on a bank of episodes, with other numbers of agents, and what they assign."""
+"""Trained policies looked at again: in evaluation episodes, with other numbers of agents, and what they assign."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -35,10 +35,16 @@ def evaluate(
     agents: Annotated[int | None, typer.Option(help="Other than the policy was trained with.")] = None,
     targets: Annotated[int | None, typer.Option(help="Other than the policy was trained with.")] = None,
     episodes: Annotated[
-        int | None, typer.Option(min=2, max=EPISODES, help="Of the bank; the run's final bank if not given.")
+        int | None,
+        typer.Option(
+            min=2, max=EPISODES, help="Evaluation episodes; as many as the run's final evaluation had if not given."
+        ),
     ] = None,
-    bank: Annotated[
-        int | None, typer.Option(min=0, max=SEED, help="Seed of the bank; the run's final bank if not given.")
+    eval_seed: Annotated[
+        int | None,
+        typer.Option(
+            min=0, max=SEED, help="Seed of the evaluation episodes; that of the run's final evaluation if not given."
+        ),
     ] = None,
     config: Annotated[
         Path | None, typer.Option(help="Settings of a .pt file, other than it names itself: a config.yaml.")
@@ -50,10 +56,10 @@ def evaluate(
 
     FILE is a study, whose finished runs (or newest checkpoints) are played, or a policy: a .pt file that a run keeps.
     """
-    from pipelines.policies.evaluation import Bank, of_file, of_study, score
+    from pipelines.policies.evaluation import EvaluationEpisodes, of_file, of_study, score
     from pipelines.workspace.work_folder import StoreError, work_folder
 
-    wanted = Bank(episodes, bank, agents, targets)
+    wanted = EvaluationEpisodes(episodes, eval_seed, agents, targets)
     try:
         if file.suffix == CHECKPOINT:
             policies = iter([of_file(file, config)])
@@ -84,7 +90,7 @@ def transfer(
     targets: Annotated[str, typer.Option(metavar="M,M", help="Numbers of targets, with the trained agents.")] = "",
     arm: Arms = None,
     seed: Seeds = None,
-    episodes: Annotated[int, typer.Option(min=2, max=EPISODES, help="Of each bank.")] = 200,
+    episodes: Annotated[int, typer.Option(min=2, max=EPISODES, help="Evaluation episodes of each task.")] = 200,
     jobs: Annotated[int, typer.Option(min=1, max=JOBS, help="Policies at a time.")] = 2,
 ) -> None:
     """Play a study's trained policies with other numbers of agents and targets, and write transfer.parquet.

@@ -122,7 +122,7 @@ def main() -> None:
 
 
 def _of_the_system(error: OSError) -> InputError | None:
-    """What the system refuses whatever the verb: a path that none can be, or one more open file."""
+    """Errors of the system in any verb: a path that none can be, or one more open file."""
     if error.errno in (errno.EMFILE, errno.ENFILE):
         return InputError(f"rhmc: {error}")
     if error.errno not in NO_PATH or error.filename is None:

@@ -25,7 +25,7 @@ Sets = Annotated[
 ]
 Out = Annotated[
     Path | None,
-    typer.Option(help="Folder for the winners; `found` beside FILE if not given, the work folder with --set."),
+    typer.Option(help="Folder for the winners; `best_params` beside FILE if not given, the work folder with --set."),
 ]
 
 app = typer.Typer(help="Search settings with the same budget for every method.", no_args_is_help=True)

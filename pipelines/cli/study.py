@@ -94,7 +94,7 @@ def list_(
 
 
 def _listed(file: Path) -> dict[str, Any] | None:
-    """What there is to say of a study; None for a search, which has a space in an arm."""
+    """The listing of a study; None for a search, which has a space in an arm."""
     from pipelines.specs.document import read
 
     root, faults = read(file)

@@ -109,7 +109,7 @@ def _serve(uri: str, artifacts: Path, port: int, saved: Iterable[tuple[str, str,
 
 
 def _write_down(server: "subprocess.Popen[bytes]", log: Path) -> None:
-    """What the server says, line by line, without passwords; to the end, for it waits where nobody reads on."""
+    """The output of the server, line by line, without passwords; to the end, for it waits where nobody reads on."""
     assert server.stdout is not None
     with suppress(OSError), log.open("w", encoding="utf-8") as file:
         for line in server.stdout:

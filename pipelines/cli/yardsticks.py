@@ -14,13 +14,13 @@ from pipelines.workspace.errors import InputError
 if TYPE_CHECKING:
     from pipelines.export.yardsticks import Scored
 
-app = typer.Typer(help="Score scripted policies and bounds.", no_args_is_help=True)
+app = typer.Typer(help="Score the yardsticks: policies without learning, and bounds.", no_args_is_help=True)
 
 Fields = dict[str, Any]
 
 
 def verb(name: str) -> Callable[[Callable[..., Fields]], Callable[..., None]]:
-    """Make a verb of a function from a task's options to its fields: the options of every bank are added to them."""
+    """Make a verb of a function from a task's options to its fields: the options that all tasks share are added."""
 
     def of_task(fields: Callable[..., Fields]) -> Callable[..., None]:
         own = inspect.signature(fields).parameters
@@ -43,11 +43,11 @@ def verb(name: str) -> Callable[[Callable[..., Fields]], Callable[..., None]]:
 def _score(
     kind: str,
     fields: Fields,
-    episodes: Annotated[int, typer.Option(min=2, max=EPISODES, help="Episodes of the bank.")] = 1000,
+    episodes: Annotated[int, typer.Option(min=2, max=EPISODES, help="Episodes of the evaluation.")] = 1000,
     policies: Annotated[
         str | None, typer.Option(help="Names with commas between; all but the planner if not given.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, max=SEED, help="Names the bank of episodes.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=SEED, help="Seed of the episodes.")] = 0,
     as_json: Json = False,
     out: Annotated[
         Path | None, typer.Option(help="Also write yardsticks.parquet there, beside the runs' tables.")
@@ -56,18 +56,18 @@ def _score(
 ) -> None:
     import torch
 
-    from rhmc.scripted.yardsticks import yardsticks
+    from rhmc.yardsticks.scores import play_yardsticks
 
     env = _env(kind, fields)
     chosen = None if policies is None else [name.strip() for name in policies.split(",")]
     _check(kind, chosen or [], profile)
     torch.set_num_threads(1)
     with folder_option(out):
-        scores = yardsticks(env, chosen, episodes=episodes, seed=seed)
+        scores = play_yardsticks(env, chosen, episodes=episodes, seed=seed)
         if out is not None:
-            from pipelines.export.yardsticks import Bank, Scored, export_yardsticks
+            from pipelines.export.yardsticks import Evaluation, Scored, export_yardsticks
 
-            written = export_yardsticks([Scored(Bank(env, tuple(scores), episodes, seed), scores)], profile, out)
+            written = export_yardsticks([Scored(Evaluation(env, tuple(scores), episodes, seed), scores)], profile, out)
             tell(f"wrote {written}")
     if as_json:
         say_json(scores)
@@ -79,7 +79,7 @@ def _score(
 
 def _check(kind: str, policies: list[str], profile: str) -> None:
     from pipelines.specs.document import choices
-    from rhmc.scripted.yardsticks import names
+    from rhmc.yardsticks.scores import names
 
     known = names(kind)
     faults = [f"--policies: '{n}' is not allowed; {choices(n, known)}" for n in policies if n not in known]
@@ -126,19 +126,19 @@ def navigation(
 def everything(
     out: Annotated[Path, typer.Option(help="Folder of the tables that the report reads; made if it is not there.")],
     profile: Profile = "quick",
-    jobs: Annotated[int, typer.Option(min=1, max=JOBS, help="Banks at a time.")] = 2,
+    jobs: Annotated[int, typer.Option(min=1, max=JOBS, help="Evaluations at a time.")] = 2,
 ) -> None:
     """Every task, policy and bound that the report uses: yardsticks.parquet, with .runs.parquet and .made.parquet.
 
     The profile decides the number of episodes. The files are written at the end, after minutes.
     """
     _check("coverage", [], profile)
-    from pipelines.export.yardsticks import banks, export_yardsticks, present, score_banks
+    from pipelines.export.yardsticks import evaluate_all, evaluations, export_yardsticks, present
 
     with folder_option(out):
         present(out)  # what cannot be brought up to date is better said before the minutes than after
-        wanted, found = banks(profile), []
-        for scored in score_banks(wanted, jobs):
+        wanted, found = evaluations(profile), []
+        for scored in evaluate_all(wanted, jobs):
             found.append(scored)
             policies = f"{len(scored.scores)} policies" if len(scored.scores) > 1 else next(iter(scored.scores))
             tell(f"{len(found)} of {len(wanted)}: {_named(scored)}: {policies}")
@@ -150,10 +150,17 @@ def everything(
 def _show(found: list["Scored"]) -> None:
     """All scores, task by task."""
     from pipelines.export.yardsticks import SEM_OF, TASKS
-    from rhmc.scripted.yardsticks import names
+    from rhmc.yardsticks.scores import names
 
     rows = sorted(
-        (TASKS.index(one.bank.env), names(one.bank.env.kind).index(name), _named(one), name, score, one.bank.env.kind)
+        (
+            TASKS.index(one.evaluation.env),
+            names(one.evaluation.env.kind).index(name),
+            _named(one),
+            name,
+            score,
+            one.evaluation.env.kind,
+        )
         for one in found
         for name, score in one.scores.items()
     )
@@ -163,7 +170,7 @@ def _show(found: list["Scored"]) -> None:
 
 def _named(scored: "Scored") -> str:
     """A task in words, with what sets it apart from the others."""
-    env: Any = scored.bank.env
+    env: Any = scored.evaluation.env
     if env.kind == "coverage":
         return f"coverage {env.preset}, {env.agents} x {env.targets}"
     return f"navigation {env.reward}, {env.agents}"

@@ -55,7 +55,7 @@ class Difference(NamedTuple):
 
 
 class Proof(NamedTuple):
-    """What came of the trainings of an arm."""
+    """The result of the trainings of an arm."""
 
     arm: str
     seeds: Sequence[int]  # trained again
@@ -147,7 +147,7 @@ def older(plan: Iterable[Item], tracker: Tracker) -> dict[str, list[Older]]:
 
 
 def _settings_id(run: Recorded, tracker: Tracker) -> str:
-    """What the settings that a run kept are called today; empty where they cannot be read."""
+    """The present id of the settings that a run kept; empty where they cannot be read."""
     spec = kept_settings(run, tracker)
     return spec.id if spec else ""
 
@@ -189,7 +189,7 @@ def _points(item: Item, until: int | None) -> int:
 
 
 def _train(job: tuple[Item, int]) -> Values:
-    """What the present code gives for a run, to the given point of its curve."""
+    """The values of the present code for a run, to the given point of its curve."""
     item, points = job
     spec = item.spec
     trainer = Trainer(spec.env, spec.algo, spec.trainer, spec.seed)

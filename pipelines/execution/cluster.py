@@ -29,7 +29,7 @@ from pipelines.workspace.work_folder import StoreError, one_line
 KNOCK = 5.0  # seconds to wait for a cluster to answer
 PULSE, MISSES = 8.0, 3  # seconds between two looks at the head, and how many in a row may find nobody
 CODE = "RHMC_CODE"  # a variable that tells workers the driver's fingerprint
-GONE = 2  # exit code where the head is: something is in the way
+GONE = 2  # exit code where the head is: environment error
 ANSWER = 90.0  # seconds to wait for a node to look around: it may start a process and import torch
 DEATHS = 3  # workers that may die in a row on one training without getting it further
 NODE_DIED = "its node has died"  # in what Ray says of an actor
@@ -72,7 +72,7 @@ def knock(where: str) -> None:
 
 
 def ask(host: str, port: int, call: str = ALIVE) -> bytes:
-    """What a program that speaks gRPC answers to a call without a token, as bytes; `STATUS` is in it.
+    """The answer of a program that speaks gRPC to a call without a token, as bytes; `STATUS` is in it.
 
     Raises:
         OSError: nobody listens, or nothing comes for `KNOCK` seconds.
@@ -108,7 +108,7 @@ def _opened() -> bool:
 
 
 def _mismatch(*, locked: bool) -> str:
-    """Why a cluster is not joined that asks for a token, or does not; empty if it is."""
+    """The reason why a cluster is not joined that asks for a token, or does not; empty if it is."""
     if locked and _opened():
         return "it asks for a token, and RAY_AUTH_MODE=disabled gives none: set RAY_AUTH_MODE=token"
     if not locked and not _opened():
@@ -156,7 +156,7 @@ def _refused(where: str, why: str) -> StoreError:
 
 
 def travelling(settings: dict[str, str]) -> dict[str, Any]:
-    """What a launch brings along to every node: the code that the driver runs, and Ray's settings for workers."""
+    """The parts that a launch brings to every node: the code that the driver runs, and Ray's settings for workers."""
     folders = [folder_of(name) for name in (PACKAGE, "pipelines")]
     return {"py_modules": [str(folder) for folder in folders], "env_vars": settings | {CODE: own_code()}}
 
@@ -183,7 +183,7 @@ def _other_code(found: str, wanted: str) -> str:
 
 
 class Fence(NamedTuple):
-    """What keeps strangers from Ray's head."""
+    """The token that keeps strangers from Ray's head."""
 
     host: str  # that it listens on
     locked: bool  # whether it refuses who has no token
@@ -199,7 +199,7 @@ def fence() -> Fence:
 
 
 class Place(NamedTuple):
-    """Where a process runs."""
+    """The place of a process."""
 
     node: str  # Ray's id, hex; empty outside Ray
     host: str
@@ -237,7 +237,7 @@ def exposed() -> list[str]:
 
 
 class Sight(NamedTuple):
-    """What a node sees."""
+    """The observations of a node."""
 
     code: str  # fingerprint, which names torch and numpy as well
     processor: str  # what torch makes use of
@@ -316,7 +316,7 @@ def _answer(node: str, call: Any) -> Sight:
 
 
 def wrong(sight: Sight, home: Path, *, written: bool, code: str) -> str:
-    """Why a node with this sight cannot take part; empty if it can."""
+    """The reason why a node with this sight cannot take part; empty if it can."""
     if not sight.sees:
         return f"does not see {home}: the work folder (RHMC_HOME) has to lie on a file system that all nodes share"
     if not written:
@@ -352,6 +352,6 @@ class Deaths:
 
     @property
     def left(self) -> int:
-        """How many more may die; none if 0 or less."""
+        """The number that may still die; none if 0 or less."""
         living = alive()
         return DEATHS - sum(not (NODE_DIED in text or (node and node not in living)) for node, text in self.seen)

@@ -1,4 +1,4 @@
-"""Whether a training still holds numbers: its metrics, and everything that it learns with.
+"""True if a training still holds finite numbers only: its metrics, and everything that it learns with.
 
 A network that holds one value that is not finite gives nothing else from then on, and its greedy policy still earns a
 return, so that the run would look like any other.

@@ -24,7 +24,7 @@ class Recorders:
         self.board: Board = self.each[0].board
 
     def _waiting(self, key: str) -> list[Recorder]:
-        """Who waits for a training; the first one has it."""
+        """The recorders that wait for a training; the first one has it."""
         return [one for one in self.each if key in one.waiting]
 
     @property
@@ -39,7 +39,7 @@ class Recorders:
         return bool(self.todo())
 
     def again(self) -> bool:
-        """Whether to train once more: what other processes were training may be free by now, or finished."""
+        """True if it has to be trained once more: trainings of other processes may be free by now, or finished."""
         busy = any(one.busy for one in self.each)
         for one in self.each:
             one.busy = False

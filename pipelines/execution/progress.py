@@ -1,4 +1,4 @@
-"""What a person sees while a study runs: a live line per run on a terminal, plain lines elsewhere."""
+"""The display of a running study: a live line per run on a terminal, plain lines elsewhere."""
 
 import sys
 import time
@@ -50,7 +50,7 @@ class Line:
 
 
 def began(reached: int, total: int) -> str:
-    """How a run starts, in words."""
+    """The start of a run, in words."""
     return f"continues at step {min(reached, total):,} of {total:,}" if reached else "started"
 
 
@@ -65,7 +65,7 @@ def duration(seconds: float) -> str:
 
 
 class Board(Protocol):
-    """Where progress is shown."""
+    """The display of progress."""
 
     def __enter__(self) -> Self: ...
     def __exit__(
@@ -248,7 +248,7 @@ class StopFile:
         self.path, self.board, self.told = path, display, False
 
     def exists(self) -> bool:
-        """Whether it is there."""
+        """True if it exists."""
         there = self.path.exists()
         if there and not self.told:
             self.told = True

@@ -249,7 +249,7 @@ class Bridge(tune.Callback):
 
     @property
     def over(self) -> bool:
-        """Whether nothing more should run."""
+        """True if nothing more should run."""
         return self.error is not None or (self.stop.exists() and not self.live)
 
 

@@ -70,7 +70,7 @@ class Recorder:
 
     @property
     def status(self) -> Status:
-        """How the study stands when the launch ends."""
+        """The status of the study when the launch ends."""
         return "failed" if self.failures else "interrupted" if self.left else "finished"
 
     def reuse(self) -> None:

@@ -46,7 +46,7 @@ def run_studies(studies: Sequence[Study], home: Path) -> int:
         home: the work folder.
 
     Returns:
-        0 all finished, 1 some run failed, 2 something is in the way, 130 interrupted, 143 terminated. A second launch
+        0 all finished, 1 some run failed, 2 environment error, 130 interrupted, 143 terminated. A second launch
         is always safe.
 
     Raises:
@@ -70,7 +70,7 @@ def missing_devices(where: Iterable[tuple[str, str]]) -> Iterator[str]:
 
 
 def _apart(studies: Sequence[Study]) -> Iterator[str]:
-    """Why studies cannot be launched together."""
+    """The reason why studies cannot be launched together."""
     first = studies[0]
     yield from given_twice(studies)
     for study in studies:
@@ -84,7 +84,7 @@ def _apart(studies: Sequence[Study]) -> Iterator[str]:
 
 
 def guarded(home: Path, names: Sequence[tuple[str, str]], launch: Callable[[Home, "Interrupts"], int]) -> int:
-    """Hold studies or a search while they are launched; what is in the way becomes one line and an exit code.
+    """Hold studies or a search while they are launched; an environment error becomes one line and an exit code.
 
     Args:
         home: the work folder.
@@ -110,7 +110,7 @@ def guarded(home: Path, names: Sequence[tuple[str, str]], launch: Callable[[Home
 
 
 class Interrupts:
-    """What Ctrl-C and SIGTERM do: while runs train, the first asks each of them to save itself and end, the second
+    """Effect of Ctrl-C and SIGTERM: while runs train, the first asks each of them to save itself and end, the second
     leaves at once; before and afterwards there is nothing to save, and the first leaves at once.
 
     Attributes:
@@ -156,7 +156,7 @@ class Interrupts:
 
 
 class Code(NamedTuple):
-    """What a launch says of its runs: the same for all of its studies."""
+    """The code and machine that a launch logs with its runs: the same for all of its studies."""
 
     commit: str
     host: Host
@@ -286,7 +286,7 @@ def _summary(launched: Sequence[Launched]) -> None:
 
 
 def _arguments(studies: Sequence[Study]) -> str:
-    """What names these plans on the command line, which gives all of them the same options."""
+    """The command-line arguments that name these plans; the command line gives all of them the same options."""
     study = studies[0]
     changes = [word for text in study.overrides for word in ("--set", text)]
     variant = ["--variant", study.variant] if study.variant else []
@@ -323,7 +323,7 @@ def show_status(study: Study, home: Path, *, as_json: bool = False) -> int:
     """Print how far a study is: per arm the runs finished, under way, failed (and why), missing, and stale (and why).
 
     Returns:
-        0 all finished, 1 not, 2 something is in the way.
+        0 all finished, 1 not, 2 environment error.
     """
     try:
         found = _status(study, Home(home))
@@ -337,18 +337,19 @@ def show_status(study: Study, home: Path, *, as_json: bool = False) -> int:
         rows = [[arm, *(str(one[c]) for c in columns)] for arm, one in found.arms.items()]
         print_table(terminal(), ["arm", *columns], rows)
         lines = [f"failed: {name}: {error}" for name, error in found.errors.items()]
-        lines += [*found.stale, *(f"note: {remark}" for remark in study.remarks)]
+        lines += [*found.stale, *(f"note: {remark}" for remark in (*study.remarks, *found.remarks))]
         terminal().print("\n".join(map(visible, lines)), soft_wrap=True, end="\n" if lines else "")
     return DONE if found.finished else FAILED
 
 
 class Standing(NamedTuple):
-    """How far a study is."""
+    """The progress of a study."""
 
     finished: bool  # all of it
     arms: dict[str, dict[str, int]]  # runs by state
     errors: dict[str, str]  # of each failed run, by its name
     stale: list[str]  # why runs are no part of the plan, a line for each arm and reason
+    remarks: list[str]  # of the log
 
 
 def _status(study: Study, home: Home) -> Standing:
@@ -370,4 +371,4 @@ def _status(study: Study, home: Home) -> Standing:
     failed = {(run.arm, run.key): run.error for run in recorded if run.status == "failed"}
     errors = {item.name: failed[item.card.arm, item.key] for item in plan if (item.card.arm, item.key) in failed}
     why = reasons(plan, recorded, tracker) if tracker else []
-    return Standing(planned <= finished(recorded), arms, errors, why)
+    return Standing(planned <= finished(recorded), arms, errors, why, tracker.remarks if tracker else [])

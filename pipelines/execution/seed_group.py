@@ -32,7 +32,7 @@ class Seeds:
 
     @property
     def done(self) -> bool:
-        """Whether the budget is spent and evaluated."""
+        """True if the budget is spent and evaluated."""
         return self.first.done
 
     def __iter__(self) -> Self:

@@ -29,7 +29,7 @@ PATIENCE = 60.0  # seconds to wait for the worker of a killed driver to let go o
 
 
 class Job(TypedDict):
-    """What a worker gets: plain values."""
+    """The input of a worker: plain values."""
 
     key: str  # spec id and fingerprint
     spec: str  # JSON
@@ -88,7 +88,7 @@ class RunTrainable(Trainable):
             self.load_state(state)
 
     def make_trainer(self) -> Trainer | Seeds:
-        """What the job asks for, untrained."""
+        """The trainings of the job, untrained."""
         spec = RunSpec.model_validate_json(self.job["spec"])
         return Trainer(spec.env, spec.algo, spec.trainer, spec.seed)
 

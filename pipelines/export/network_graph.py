@@ -151,7 +151,7 @@ def _edges(calls: list[Call], inputs: dict[str, Tensor], output: Tensor) -> list
 
 
 def _sources(start: Any, made: dict[Any, str], inputs: dict[str, Tensor]) -> list[tuple[str, frozenset[str]]]:
-    """Where a tensor comes from: layers' outputs and inputs, with the operations on the way. `start`: its grad_fn."""
+    """The origin of a tensor: layers' outputs and inputs, with the operations on the way. `start`: its grad_fn."""
     leaves = {id(x): name for name, x in inputs.items()}
     todo: list[tuple[Any, frozenset[str]]] = [(start, frozenset())] if start is not None else []
     seen: set[tuple[Any, frozenset[str]]] = set()

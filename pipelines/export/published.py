@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import pandas as pd
 import pyarrow as pa
 
-from pipelines.export.tables import METRICS, write_parquet, write_tables
+from pipelines.export.tables import METRICS, VERSION, write_parquet, write_tables
 from pipelines.specs.study import RunSpec, Study
 from pipelines.tracking.plan import items, study_card
 from pipelines.workspace.errors import InputError
@@ -24,14 +24,13 @@ from rhmc.training.trainer import Trainer
 RESULTS = Path("results")
 NAME = "results"  # of the tables of a profile in small form
 CURVE, FINALS = "eval/return", "final/"
-RUNS = pa.schema([field for field in METRICS if field.name in {"study", "arm", "seed", "run"}]).append(
-    pa.field("profile", pa.string())
-)
+PLACE = [field for field in METRICS if field.name in {"study", "arm", "seed", "run"}]
+RUNS = pa.schema([*PLACE, pa.field("profile", pa.string())], metadata=VERSION)
 CONFIG = pa.field("config", pa.string())  # the spec as canonical JSON
 
 
 def folder(profile: str) -> Path:
-    """Where the repository holds the results of a profile."""
+    """The folder where the repository holds the results of a profile."""
     small = RESULTS / "published" / profile
     return small if small.is_dir() else RESULTS / profile / "runs"
 
@@ -62,7 +61,7 @@ def trained(values: pd.DataFrame, runs: pd.DataFrame) -> tuple[pd.DataFrame, pd.
     """Values and runs of trainings alone, without yardsticks and Theorem 1, of which no log knows."""
     if "algorithm" not in runs:  # results in small form are of trainings
         return values, runs
-    mine = runs[~runs["algorithm"].isin(["scripted", "theorem"])]
+    mine = runs[~runs["algorithm"].isin(["yardstick", "theorem"])]
     return values[values["study"].isin(mine["study"])], mine
 
 

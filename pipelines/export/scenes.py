@@ -12,7 +12,7 @@ from torch import Generator, Tensor
 from rhmc.envs import coverage, navigation
 from rhmc.hierarchy.regulation import Path, algorithm1_path, exact, optimal_path, paper
 from rhmc.hierarchy.theorem import smallest_counterexample
-from rhmc.scripted import SCRIPTED
+from rhmc.yardsticks import POLICIES
 
 Record = dict[str, Any]
 
@@ -50,7 +50,7 @@ def _navigation(policy: str = "matching") -> Record:
     state = navigation.initial(cfg, 1, rng)
     positions = [state.position[0]]
     for _ in range(cfg.episode):
-        state = navigation.transition(cfg, state, SCRIPTED[cfg.kind][policy](cfg, state, rng), rng)
+        state = navigation.transition(cfg, state, POLICIES[cfg.kind][policy](cfg, state, rng), rng)
         positions.append(state.position[0])
     return {
         "policy": policy,
@@ -66,7 +66,7 @@ def _coverage(agents: int, policy: str = "best_window") -> Record:
     cfg, rng = coverage.Config(agents=agents, targets=TARGETS), Generator().manual_seed(SEED)
     state = coverage.initial(cfg, 1, rng)
     for _ in range(TURNED):
-        state = coverage.transition(cfg, state, SCRIPTED[cfg.kind][policy](cfg, state, rng), rng)
+        state = coverage.transition(cfg, state, POLICIES[cfg.kind][policy](cfg, state, rng), rng)
     return {
         "agents": agents,
         "policy": policy,
@@ -108,7 +108,7 @@ def _counterexample(by: Literal["reward", "count"]) -> Record:
 
 
 def _instance(kept: list[Tensor], held: Tensor) -> Record:
-    """What each agent's options complete, N times (D_i, M), who is assigned to what (N, M), and both paths."""
+    """The targets that each agent's options complete, N times (D_i, M), the assignment (N, M), and both paths."""
     options = _padded(kept)
     paths = {"algorithm_1": algorithm1_path(options, held, ALPHA), "optimum": optimal_path(options, held, ALPHA)}
     return {
@@ -131,7 +131,7 @@ def _met(horizon: int, policy: str = "nearest") -> Met:
     state = coverage.initial(cfg, EPISODES, rng)
     options, assignments = [], []
     for step in range(1, LENGTH + 1):
-        state = coverage.transition(cfg, state, SCRIPTED[cfg.kind][policy](cfg, state, rng), rng)
+        state = coverage.transition(cfg, state, POLICIES[cfg.kind][policy](cfg, state, rng), rng)
         if step % EVERY == 0:
             options.append(coverage.options(cfg, state, horizon))
             assignments.append(torch.rand(EPISODES, cfg.agents, cfg.targets, generator=rng) < 0.5)
@@ -141,7 +141,7 @@ def _met(horizon: int, policy: str = "nearest") -> Met:
 
 
 def _distinct(met: Met, index: int) -> list[Tensor]:
-    """What each agent can complete of its own targets, each set once, in the order of its options: N times (D_i, M)."""
+    """The sets of its own targets that each agent can complete, in the order of its options: N times (D_i, M)."""
     held = met.options[index] & met.assignment[index].unsqueeze(1)
     rows = [list(dict.fromkeys(tuple(row) for row in agent.tolist())) for agent in held]
     return [torch.tensor(row) for row in rows]

@@ -21,6 +21,7 @@ from pipelines.workspace.work_folder import Home, StoreError, lacks_memory, reas
 
 PLACE = [("study", pa.string()), ("arm", pa.string()), ("seed", pa.int64()), ("run", pa.string())]  # run: spec id
 METRICS = pa.schema([*PLACE, ("step", pa.int64()), ("metric", pa.string()), ("value", pa.float64())])
+VERSION = {"rhmc.tables": "2"}  # of the names in the tables of runs; the report sets tables of an older one aside
 RUNS = pa.schema(  # the planned runs: nothing here depends on commit, machine or time
     [
         *PLACE,
@@ -31,7 +32,8 @@ RUNS = pa.schema(  # the planned runs: nothing here depends on commit, machine o
         ("config", pa.string()),  # the spec as canonical JSON
         ("fingerprint", pa.string()),  # code id
         ("question", pa.string()),
-    ]
+    ],
+    metadata=VERSION,
 )
 MADE = pa.schema(  # the runs that are there: how and where each was made
     [
@@ -56,8 +58,8 @@ def export_study(study: Study, out: Path, home: Path | None = None) -> int:
         home: work folder, see `work_folder`.
 
     Returns:
-        0 all planned runs are there and finished, 1 some are not (the files are written all the same), 2 something is
-        in the way.
+        0 all planned runs are there and finished, 1 some are not (the files are written all the same), 2 environment
+        error.
     """
     from pipelines.tracking.mlflow_tracker import open_existing
 

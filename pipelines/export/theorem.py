@@ -1,4 +1,4 @@
-"""How often Algorithm 1 misses the optimum, as a table of the form that runs are exported in."""
+"""The shortfall of Algorithm 1, as a table of the form that runs are exported in."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Scores of the scripted policies as tables of the form that runs are exported in."""
+"""Scores of the yardsticks as tables of the form that runs are exported in."""
 
 import hashlib
 import json
@@ -16,10 +16,10 @@ from pipelines.workspace.provenance import host
 from rhmc.envs import EnvConfig
 from rhmc.envs.coverage import Config as Coverage
 from rhmc.envs.navigation import Config as Navigation
-from rhmc.scripted.yardsticks import SLOW, names, yardsticks
+from rhmc.yardsticks.scores import SLOW, names, play_yardsticks
 
 STUDY = "yardsticks"
-QUESTION = "What do scripted policies and bounds reach?"
+QUESTION = "What do policies without learning, and bounds, reach?"
 SEM_OF = {"coverage": "coverage", "navigation": "return"}  # whose standard error a task's `sem` is
 
 # What the report uses: the studies' tasks, and coverage with other numbers, one changed at a time.
@@ -31,14 +31,14 @@ TASKS: tuple[EnvConfig, ...] = (
     Navigation(agents=3, reward="paper"),
     Navigation(agents=3, reward="mpe1"),
 )
-SEED = 0  # of every bank
+SEED = 0  # of every yardstick's episodes
 
 Scores = Mapping[str, Mapping[str, float]]
 Row = dict[str, Any]
 
 
 class Episodes(NamedTuple):
-    """Of a bank."""
+    """Of a evaluation."""
 
     most: int
     slow: int  # of `SLOW` policies
@@ -48,7 +48,7 @@ class Episodes(NamedTuple):
 EPISODES = {"quick": Episodes(300, 60), "paper": Episodes(1000, 300)}
 
 
-class Bank(NamedTuple):
+class Evaluation(NamedTuple):
     """Policies that play the same episodes of a task."""
 
     env: EnvConfig
@@ -58,43 +58,43 @@ class Bank(NamedTuple):
 
 
 class Scored(NamedTuple):
-    """A bank and what was reached on it, as `rhmc.scripted.yardsticks.yardsticks` gives it."""
+    """Yardsticks in their episodes and the scores, as `rhmc.yardsticks.scores.play_yardsticks` gives it."""
 
-    bank: Bank
+    evaluation: Evaluation
     scores: Scores
 
 
-def banks(profile: str) -> list[Bank]:
-    """What the report of a profile uses, the slowest first: no process should begin with a long one at the end."""
+def evaluations(profile: str) -> list[Evaluation]:
+    """The evaluations that a profile's report uses, the slowest first, so that none of them begins late."""
     found = []
     for env in TASKS:
         slow = tuple(name for name in names(env.kind) if name in SLOW)
         most = tuple(name for name in names(env.kind) if name not in SLOW)
         counts = EPISODES[profile]
-        found += [Bank(env, slow, counts.slow)] if slow else []
-        found += [Bank(env, most, counts.most)]
+        found += [Evaluation(env, slow, counts.slow)] if slow else []
+        found += [Evaluation(env, most, counts.most)]
     return sorted(found, key=_quickness)
 
 
-def _quickness(bank: Bank) -> tuple[bool, bool, int]:
+def _quickness(evaluation: Evaluation) -> tuple[bool, bool, int]:
     """As measured: episodes of the coordinator preset take ten times as long, and then it is the planner."""
-    env = bank.env
+    env = evaluation.env
     size = env.agents * getattr(env, "targets", env.agents)
-    return getattr(env, "preset", "") != "coordinator", not set(bank.policies) & set(SLOW), -size
+    return getattr(env, "preset", "") != "coordinator", not set(evaluation.policies) & set(SLOW), -size
 
 
-def score_banks(wanted: Sequence[Bank], jobs: int) -> Iterator[Scored]:
-    """Play banks, `jobs` at a time, each in a process of its own; what comes out does not depend on it.
+def evaluate_all(wanted: Sequence[Evaluation], jobs: int) -> Iterator[Scored]:
+    """Play evaluations, `jobs` at a time, each in a process of its own; what comes out does not depend on it.
 
     Raises:
         StoreError: one of the processes was killed.
     """
-    for bank, scores in zip(wanted, side_by_side(_play, wanted, jobs), strict=True):
-        yield Scored(bank, scores)
+    for evaluation, scores in zip(wanted, side_by_side(_play, wanted, jobs), strict=True):
+        yield Scored(evaluation, scores)
 
 
-def _play(bank: Bank) -> Scores:
-    return yardsticks(*bank)
+def _play(evaluation: Evaluation) -> Scores:
+    return play_yardsticks(*evaluation)
 
 
 class Tables(NamedTuple):
@@ -106,7 +106,7 @@ class Tables(NamedTuple):
 
 
 def present(out: Path) -> Tables:
-    """What a folder has already.
+    """The tables that a folder has already.
 
     Raises:
         InputError: there is another file under one of the names.
@@ -122,7 +122,7 @@ def export_yardsticks(found: Iterable[Scored], profile: str, out: Path) -> Path:
     local) is left out: no figure could place it.
 
     Args:
-        found: banks with their scores, in any order.
+        found: evaluations with their scores, in any order.
         profile: of the report that they are for.
         out: the folder.
 
@@ -134,8 +134,10 @@ def export_yardsticks(found: Iterable[Scored], profile: str, out: Path) -> Path:
         StoreError: the folder cannot be written to.
     """
     before, code, here = present(out), fingerprint(), _here()
-    placed = [(bank, name, score) for bank, scores in found for name, score in scores.items() if "return" in score]
-    runs = [_run(bank, name, code, profile) for bank, name, _ in placed]
+    placed = [
+        (evaluation, name, score) for evaluation, scores in found for name, score in scores.items() if "return" in score
+    ]
+    runs = [_run(evaluation, name, code, profile) for evaluation, name, _ in placed]
     values = [row for run, (_, _, score) in zip(runs, placed, strict=True) for row in _values(run, score)]
     made = [run | here for run in runs]
     new = {_place(run) for run in runs}
@@ -155,13 +157,13 @@ def _files(out: Path) -> tuple[Path, ...]:
 
 
 def _here() -> Row:
-    """How and where scores of today are made; the time of a single policy is not taken."""
+    """The machine and code that make the scores; the time of a single policy is not taken."""
     return {"commit": commit(), "seconds": 0.0, "adopted": ""} | host()._asdict()
 
 
-def _run(bank: Bank, name: str, code: str, profile: str) -> Row:
-    env = bank.env.model_dump(mode="json")
-    config = {"env": env, "episodes": bank.episodes, "bank": bank.seed, "policy": name}
+def _run(evaluation: Evaluation, name: str, code: str, profile: str) -> Row:
+    env = evaluation.env.model_dump(mode="json")
+    config = {"env": env, "episodes": evaluation.episodes, "seed": evaluation.seed, "policy": name}
     text = json.dumps(config, sort_keys=True, separators=(",", ":"))
     return {
         "study": STUDY,
@@ -169,8 +171,8 @@ def _run(bank: Bank, name: str, code: str, profile: str) -> Row:
         "seed": 0,
         "run": hashlib.sha256(text.encode()).hexdigest()[:12],
         "status": "finished",
-        "algorithm": "scripted",
-        "task": bank.env.kind,
+        "algorithm": "yardstick",
+        "task": evaluation.env.kind,
         "profile": profile,
         "config": text,
         "fingerprint": code,

@@ -60,7 +60,7 @@ def gif(env: EnvConfig, panels: Sequence[Panel], frames: int, milliseconds: int)
 
 
 def _palette() -> Image.Image:
-    """What all frames are drawn in: every colour, and its mixtures with white that views and smooth edges need."""
+    """The palette of all frames: every colour, and its mixtures with white that views and smooth edges need."""
     solid = [INK, PALE, SEEN, MISSED, *TEAM]
     mixed = [tuple(round(255 + share * (part - 255)) for part in colour) for colour in solid for share in (0.22, 0.55)]
     flat = [part for colour in [(255, 255, 255), *solid, *mixed] for part in colour]

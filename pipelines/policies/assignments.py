@@ -1,4 +1,4 @@
-"""What a coordinator assigns while it learns: pairs, conflicts, and how far Algorithm 1 falls short in those states.
+"""Assignments of a coordinator while it learns: pairs, conflicts, and how far Algorithm 1 falls short in those states.
 
 The runs' logs do not hold this, so the runs are trained again, step by step the same (watching draws nothing), and
 every `EVERY`-th step of their training is looked at. The rows belong to the runs of the study, beside its table.

@@ -1,4 +1,4 @@
-"""Trained policies on a bank of episodes, also with other numbers of agents and targets than they were trained with."""
+"""Trained policies in evaluation episodes, also with other numbers of agents and targets than in training."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -20,7 +20,7 @@ from rhmc.envs import ENVS, EnvConfig
 from rhmc.training.evaluation import evaluate
 from rhmc.types import Metrics
 
-FINAL = 5_000_000  # from the seed of the bank of a curve to that of the final one, as the trainer has it
+FINAL = 5_000_000  # from the seed of a curve's evaluation episodes to that of the final ones, as in the trainer
 
 
 class Policy(NamedTuple):
@@ -30,8 +30,8 @@ class Policy(NamedTuple):
     saved: Saved
 
 
-class Bank(NamedTuple):
-    """What to play: None stands for what the run itself ended with."""
+class EvaluationEpisodes(NamedTuple):
+    """The episodes to play; None stands for the value of the run's own final evaluation."""
 
     episodes: int | None = None
     seed: int | None = None
@@ -40,7 +40,7 @@ class Bank(NamedTuple):
 
 
 class Score(NamedTuple):
-    """Means over the bank; `values["return_sem"]` is the standard error of the return."""
+    """Means over the episodes; `values["return_sem"]` is the standard error of the return."""
 
     arm: str
     seed: int
@@ -49,8 +49,8 @@ class Score(NamedTuple):
     values: Metrics
 
 
-def score(policy: Policy, bank: Bank) -> Score:
-    """Play the bank greedily.
+def score(policy: Policy, wanted: EvaluationEpisodes) -> Score:
+    """Play the evaluation episodes greedily.
 
     Raises:
         InputError: no such task, or the policy cannot act in it.
@@ -58,22 +58,22 @@ def score(policy: Policy, bank: Bank) -> Score:
     spec, reached = policy.saved.spec, policy.saved.reached
     trainer = spec.trainer
     torch.set_num_threads(trainer.threads)
-    env = task(spec.env, bank)
-    episodes = bank.episodes or trainer.final_episodes
-    seed = trainer.eval_seed + FINAL if bank.seed is None else bank.seed
+    env = task(spec.env, wanted)
+    episodes = wanted.episodes or trainer.final_episodes
+    seed = trainer.eval_seed + FINAL if wanted.seed is None else wanted.seed
     device = trainer.device if torch.cuda.is_available() else "cpu"  # a policy from elsewhere acts here as well
     played = evaluate(_acting(policy, env, device), env, episodes, seed, device)
     values = {name.removeprefix("final/"): value for name, value in played.means("final").items()}
     return Score(policy.arm, spec.seed, reached, episodes, values)
 
 
-def task(env: EnvConfig, bank: Bank) -> EnvConfig:
+def task(env: EnvConfig, episodes: EvaluationEpisodes) -> EnvConfig:
     """The task with other numbers of agents and targets.
 
     Raises:
         InputError: there is no such task; the option is named.
     """
-    wanted = {name: n for name, n in (("agents", bank.agents), ("targets", bank.targets)) if n is not None}
+    wanted = {name: n for name, n in (("agents", episodes.agents), ("targets", episodes.targets)) if n is not None}
     if not wanted:
         return env
     fields = {name: _option(value, name) for name, value in (env.model_dump(mode="json") | wanted).items()}

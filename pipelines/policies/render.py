@@ -15,9 +15,9 @@ from pipelines.workspace.errors import InputError
 from pipelines.workspace.leftovers import scratch
 from pipelines.workspace.work_folder import Home, StoreError, whole
 from rhmc.envs import ENVS, EnvConfig, coverage
-from rhmc.scripted import SCRIPTED
-from rhmc.scripted.coverage import windows
-from rhmc.scripted.joint import best_choice
+from rhmc.yardsticks import POLICIES
+from rhmc.yardsticks.coverage import windows
+from rhmc.yardsticks.joint import best_choice
 
 FRAMES, MILLISECONDS = 40, 110
 RUN = re.compile(r"[0-9a-f]{32}")  # how MLflow names a run
@@ -27,7 +27,7 @@ Act = Callable[[Any], tuple[Tensor, Tensor | None]]  # state -> action (1, N[, A
 
 
 def trained(actor: policy.Actor) -> Act:
-    """How a trained policy acts in a state."""
+    """The action of a trained policy in a state."""
     observe = ENVS[actor.env.kind].physics.observe
 
     def act(state: Any) -> tuple[Tensor, Tensor | None]:
@@ -37,13 +37,13 @@ def trained(actor: policy.Actor) -> Act:
     return act
 
 
-def scripted(env: EnvConfig, name: str, episode: int) -> Act:
-    """How a policy without learning acts; its own draws have a generator of their own.
+def yardstick(env: EnvConfig, name: str, episode: int) -> Act:
+    """The action of a policy without learning; its own draws have a generator of their own.
 
     Raises:
         InputError: the task has no such policy.
     """
-    table = SCRIPTED[env.kind]
+    table = POLICIES[env.kind]
     if name not in table:
         known = [*table, FREE] if env.kind == "coverage" else [*table]
         raise InputError(f"--beside: '{name}' is not allowed; {choices(name, known)}")
@@ -58,8 +58,8 @@ def panel(env: EnvConfig, name: str, episode: int) -> list[Scene]:
         InputError: the task has neither.
     """
     if name == FREE and env.kind == "coverage":
-        return play(env, scripted(env, "hold", episode), episode, freely)
-    return play(env, scripted(env, name, episode), episode)
+        return play(env, yardstick(env, "hold", episode), episode, freely)
+    return play(env, yardstick(env, name, episode), episode)
 
 
 def freely(state: coverage.State) -> coverage.State:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import pyarrow as pa
 
 from pipelines.export.tables import write_parquet
-from pipelines.policies.evaluation import Bank, Policy, score
+from pipelines.policies.evaluation import EvaluationEpisodes, Policy, score
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.process_pool import side_by_side
 from pipelines.workspace.work_folder import without_replay
@@ -43,7 +43,7 @@ class Size(NamedTuple):
 
 
 def sizes(policy: Policy, agents: Sequence[int], targets: Sequence[int]) -> list[Size]:
-    """What to play: the trained numbers, other numbers of agents with them, and other numbers of targets with them."""
+    """Sizes to play: the trained numbers, and those with another number of agents, or of targets."""
     env = policy.saved.spec.env
     own = Size(env.agents, getattr(env, "targets", env.agents))
     changed = [Size(n, own.targets) for n in agents] + [Size(own.agents, m) for m in targets]
@@ -65,7 +65,7 @@ def transfer(
         policies: to play.
         agents: numbers of agents, see `sizes`.
         targets: numbers of targets.
-        episodes: of each bank.
+        episodes: of each size of the task.
         jobs: policies at a time, each in a process of its own; the rows do not depend on it.
 
     Raises:
@@ -89,7 +89,7 @@ def _play(policy: Policy, study: str, agents: Sequence[int], targets: Sequence[i
         raise InputError(f"{policy.arm}: transfer is of coverage, where agents and targets have numbers of their own")
     rows: list[Row] = []
     for size in sizes(policy, agents, targets):
-        found = score(policy, Bank(episodes=episodes, agents=size.agents, targets=size.targets))
+        found = score(policy, EvaluationEpisodes(episodes=episodes, agents=size.agents, targets=size.targets))
         place = (study, policy.arm, policy.saved.spec.seed, policy.saved.spec.id, f"{env.kind} {env.preset}")
         values = (found.values["return"], found.values["return_sem"])
         rows.append((*place, *size, env.agents, env.targets, episodes, *values))

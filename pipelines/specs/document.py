@@ -46,7 +46,7 @@ class Unreadable(enum.Enum):
 
 
 class Place(NamedTuple):
-    """Where something was written: a file with line and column (from 1), or the override itself."""
+    """The place where something was written: a file with line and column (from 1), or the override itself."""
 
     source: str
     line: int = 0
@@ -111,7 +111,7 @@ def override(text: str, path: str, value: str) -> tuple[Node | None, list[Fault]
 
 
 def _unreadable(path: Path, fault: str) -> str:
-    """What is wrong with a path, and what may have been meant."""
+    """The fault of a path, with the nearest existing name."""
     with suppress(OSError):
         if path.is_dir():
             found = sorted(p.name for p in path.glob("*.yaml"))
@@ -360,7 +360,7 @@ def _fault(model: type[BaseModel], root: Node, error: ErrorDetails, hidden: tupl
 
 
 def _rule(node: Node, error: ErrorDetails) -> str:
-    """What is allowed instead of the node's value."""
+    """The values that are allowed instead of the node's value."""
     context = error.get("ctx", {})
     if error["type"] == "literal_error":
         allowed = context["expected"].replace(" or ", ", ").split(",")
@@ -419,7 +419,7 @@ def show(value: Any) -> str:
 
 
 def choices(value: Any, allowed: Iterable[str]) -> str:
-    """What is allowed instead, and the nearest of it."""
+    """The values that are allowed instead, and the nearest of it."""
     names = list(allowed)
     more = f" and {len(names) - LISTED:,} more" if len(names) > LISTED else ""
     return f"allowed: {', '.join(names[:LISTED])}{more}{nearest(str(value), names)}"

@@ -41,7 +41,7 @@ def modules(method: str, task: str, plugins: Iterable[str] = ()) -> Mapping[str,
 
 
 def present() -> frozenset[str]:
-    """What the code of a run can be called here: of every method in every task."""
+    """The code ids that are possible here: of every method in every task."""
     return frozenset(code_id(method, task) for method in ALGORITHMS for task in ENVS)
 
 
@@ -68,7 +68,7 @@ def combined(digests: Iterable[str]) -> str:
 
 
 def folder_of(package: str) -> Path:
-    """Where a package would be imported from; of a single module, its file.
+    """The folder that a package would be imported from; of a single module, its file.
 
     Raises:
         ModuleNotFoundError: it is not installed.

@@ -33,7 +33,7 @@ def starts(setting: Setting) -> list[Start]:
 
 
 def shortfall(setting: Setting) -> str:
-    """What a budget leaves untrained, with the least one that does not, in one line; nothing if it is enough."""
+    """The parts that a budget leaves untrained, with the least budget that is enough, in one line; else nothing."""
     taken = _up(setting.trainer.steps, setting.trainer.num_envs)
     late = [one for one in starts(setting) if one.step is None or one.step > taken]
     if not late:

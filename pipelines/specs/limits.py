@@ -1,4 +1,4 @@
-"""What no study, search or option may ask for, whatever the method: bounds on every number, devices, and what cannot go
+"""Limits of every study, search and option, whatever the method: bounds on every number, devices, and what cannot go
 together. The configurations of the science package say what is right; this says what is absurd.
 """
 
@@ -51,7 +51,7 @@ DEVICE = re.compile(r"cpu|cuda(:\d{1,2})?")
 
 
 def beyond(name: str, value: Any) -> str:
-    """What is allowed instead of a field's value, nothing if the value is.
+    """The values that are allowed instead of a field's value, nothing if the value is.
 
     Args:
         name: of the field, such as `num_envs`.
@@ -73,7 +73,7 @@ def numeric(model: "type[BaseModel]") -> Iterator[str]:
 
 
 def misfit(env: Any, algo: Any) -> str:
-    """Why a method cannot learn in a task, as `field: text` with a field of the task, or nothing."""
+    """The reason why a method cannot learn in a task, as `field: text` with a field of the task, or nothing."""
     from rhmc.hierarchy.regulation import MOST_TARGETS  # brings torch along, which a fault in a file can do without
 
     field = "targets" if "targets" in type(env).model_fields else "agents"  # navigation has as many of both

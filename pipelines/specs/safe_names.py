@@ -78,17 +78,17 @@ def alike(names: Iterable[str]) -> list[tuple[str, str]]:
 
 
 def simple(name: str) -> bool:
-    """Whether a name may be part of a file's, wherever that is: letters, digits, `-` and `_`."""
+    """True if a name may be part of a file's, wherever that is: letters, digits, `-` and `_`."""
     return name.replace("_", "").replace("-", "").isalnum()
 
 
 def study_name(file: Path, variant: str = "") -> str:
-    """What a study is called: its file's stem, in the normal form that most file systems keep, and its variant."""
+    """The name of a study: its file's stem, in the normal form that most file systems keep, and its variant."""
     return unicodedata.normalize("NFC", file.stem) + (f"@{variant}" if variant else "")
 
 
 def fault_of_study(stem: str) -> str:
-    """Why a file of this stem can be no study or search; nothing if it can."""
+    """The reason why a file of this stem can be no study or search; nothing if it can."""
     if not simple(stem):
         return "a study's file is named with letters, digits, '-' and '_' only"
     if stem.startswith("-"):
@@ -103,6 +103,6 @@ def fault_of_study(stem: str) -> str:
 
 
 def too_long(name: str) -> str:
-    """Why a study's name is too long; nothing if it is not."""
+    """The reason why a study's name is too long; nothing if it is not."""
     size = len(name.encode())
     return f"a name of {size} bytes; at most {STUDY}, for it is part of other names" if size > STUDY else ""

@@ -47,7 +47,7 @@ from pipelines.specs.study import (
 from rhmc.types import Frozen
 
 FIRST_SEED = 500_000  # a search trains on seeds of its own, so that a study tries its winner on others
-EVAL_SEED = 20_000_000  # and evaluates on banks of its own, unless the file names others
+EVAL_SEED = 20_000_000  # evaluation episodes of its own, unless the file names others
 COMBINATIONS = 2_000  # of extremes, that are tried in a check
 COUNTS = ("trials", "seeds", "steps")
 
@@ -55,7 +55,7 @@ Value = str | int | float | bool | None
 
 
 class Dimension(Frozen):
-    """What one setting may be: from `low` to `high`, or one of `choices`."""
+    """The values that one setting may take: from `low` to `high`, or one of `choices`."""
 
     low: float | None = None
     high: float | None = None
@@ -99,7 +99,7 @@ class Dimension(Frozen):
 
 
 class Sampler(Frozen):
-    """How settings are proposed."""
+    """The method that proposes settings."""
 
     kind: Literal["tpe", "random"] = "tpe"
     seed: int = Field(0, ge=0)
@@ -116,14 +116,14 @@ class Pruner(Frozen):
 
 
 class SearchArm(Frozen):
-    """What an arm may state. Its space is checked against its method later."""
+    """The keys that an arm may state. Its space is checked against its method later."""
 
     algo: dict[str, Any] = Field(default_factory=dict)
     space: dict[str, Any] = Field(min_length=1)
 
 
 class Profiles(Frozen):
-    """What each profile changes in the base: no profile does with fewer arms."""
+    """The changes of each profile in the base: no profile does with fewer arms."""
 
     quick: Layer = Layer()
     paper: Layer = Layer()
@@ -270,7 +270,7 @@ def _dimension(name: str, node: Node, setting: Setting) -> tuple[Dimension | Non
 
 
 def _whole(annotation: Any) -> bool:
-    """Whether a field holds whole numbers alone."""
+    """True if a field holds whole numbers alone."""
     kinds = set(get_args(annotation)) or {annotation}
     return int in kinds and float not in kinds
 
@@ -284,7 +284,7 @@ def _extremes(node: Node) -> list[Node]:
 
 
 def _tried(setting: Setting, values: dict[str, Node]) -> list[Fault]:
-    """What the method says against these values; a fault about a value is at its place."""
+    """The faults that the method finds in these values; a fault about a value is at its place."""
     place = next(iter(values.values())).place
     layers = [nested(key.split("."), value) for key, value in values.items()]
     whole = reduce(merge, layers, _written("", setting.algo.model_dump(mode="json"), place))

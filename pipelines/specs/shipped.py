@@ -9,7 +9,7 @@ from pipelines.workspace.work_folder import whole
 
 
 def names() -> list[str]:
-    """What can be copied."""
+    """The files that can be copied."""
     return sorted(path.stem for path in SHIPPED.glob("*.yaml"))
 
 

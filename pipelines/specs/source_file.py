@@ -12,7 +12,7 @@ from pipelines.workspace.work_folder import Home
 
 
 def another(home: Home, name: str, profile: str, file: str) -> str:
-    """What to say where the last launch of this name was from another file, which is still there; nothing otherwise."""
+    """A remark if the last launch of this name was from another file, which is still there; nothing otherwise."""
     with suppress(OSError):
         before = Path(os.fsdecode(_note(home, name, profile).read_bytes()))
         if file and before.name and before.is_file() and not before.samefile(file):

@@ -104,7 +104,7 @@ class Setting(Frozen):
 class RunSpec(Setting):
     """All that decides a run's result, the code and its libraries aside."""
 
-    seed: int = Field(ge=0, lt=1_000_000)  # the evaluation banks' generators are seeded from 10 million on
+    seed: int = Field(ge=0, lt=1_000_000)  # the generators of evaluation episodes are seeded from 10 million on
 
     @property
     def id(self) -> str:
@@ -125,7 +125,7 @@ class PlannedRun(NamedTuple):
 
 
 class Resources(Frozen):
-    """How a study is run; changes no result."""
+    """Resources and pace of a study; changes no result."""
 
     concurrent: int = Field(2, ge=1, description="runs at a time")
     cpus: int = Field(1, ge=1, description="processors of a run")
@@ -188,7 +188,7 @@ class Study(Frozen):
 
 
 def changes(base: Setting, setting: Setting) -> dict[str, Any]:
-    """What differs from the base, by dotted path; of another kind, the kind alone."""
+    """The differences from the base, by dotted path; of another kind, the kind alone."""
     differs: dict[str, Any] = {}
     for section in SECTIONS:
         before, after = getattr(base, section), getattr(setting, section)
@@ -204,7 +204,7 @@ def changes(base: Setting, setting: Setting) -> dict[str, Any]:
 
 
 class Layer(Frozen):
-    """What the base, a profile or an arm states."""
+    """The statements of the base, a profile or an arm."""
 
     env: dict[str, Any] = Field(default_factory=dict)
     algo: dict[str, Any] = Field(default_factory=dict)
@@ -212,7 +212,7 @@ class Layer(Frozen):
 
 
 class Base(Layer):
-    """What every run starts from."""
+    """The settings that every run starts from."""
 
     env: dict[str, Any]
     algo: dict[str, Any]
@@ -236,7 +236,7 @@ Grid = dict[str, Annotated[list[Any], Field(min_length=1)]]  # by dotted name of
 
 
 class Profile(Layer):
-    """What a profile changes in the base and in single arms, which it is content with, and which values of the grid."""
+    """The changes of a profile in the base and in single arms, the arms that it runs, and the values of the grid."""
 
     arms: list[str] | None = Field(None, min_length=1)
     changes: dict[str, Layer] = Field(default_factory=dict)
@@ -244,7 +244,7 @@ class Profile(Layer):
 
 
 class Profiles(Frozen):
-    """What each profile changes."""
+    """The changes of each profile."""
 
     quick: Profile = Profile()
     paper: Profile = Profile()
@@ -587,14 +587,14 @@ def _crowded(root: Node) -> list[Fault]:
 
 
 def study_fault(name: str) -> str:
-    """What is wrong with the name of a study (of a variant: `stem@variant`), or nothing; it becomes part of paths."""
+    """The fault of the name of a study (of a variant: `stem@variant`), or nothing; it becomes part of paths."""
     stem, at, variant = name.partition("@")
     fault = fault_of_study(stem) or too_long(name)
     return fault or ("a variant is named with letters, digits, '-' and '_' only" if at and not simple(variant) else "")
 
 
 def arm_fault(name: str) -> str:
-    """What is wrong with the name of an arm, or nothing."""
+    """The fault of the name of an arm, or nothing."""
     if not all(map(seen, name)):
         return f"{show(name)} is no name for an arm; it has characters that cannot be seen"
     arm = Node(None, Place(""), Place(""), "")

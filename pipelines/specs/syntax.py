@@ -31,7 +31,7 @@ class Binding(NamedTuple):
 
 
 class Target(NamedTuple):
-    """What a name stands for; `module` is empty outside the packages that are looked at."""
+    """The object that a name stands for; `module` is empty outside the packages that are looked at."""
 
     module: str
     name: str
@@ -131,7 +131,7 @@ class Source:
 
 
 def _counts(node: ast.AST) -> bool:
-    """Whether a statement is more than a text, an import, a list of names to be offered, or for type checkers alone."""
+    """True if a statement is more than a text, an import, a list of names to be offered, or for type checkers alone."""
     if isinstance(node, ast.Import | ast.ImportFrom):
         return False
     if isinstance(node, ast.Expr):
@@ -150,7 +150,7 @@ def _walk(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def _bindings(node: ast.AST, base: str) -> Iterator[Binding]:
-    """What an import binds; `base` is the package that relative imports start from."""
+    """The names that an import binds; `base` is the package that relative imports start from."""
     if isinstance(node, ast.Import):
         for alias in node.names:
             yield Binding(alias.asname or alias.name.partition(".")[0], alias.name, "")

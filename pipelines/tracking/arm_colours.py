@@ -27,7 +27,7 @@ def colour(place: int) -> str:
 
 @cache
 def legend(arm: str, place: int) -> str:
-    """What an arm's runs are grouped by: it reads as the arm's name and has the colour of its place."""
+    """The group of an arm's runs in MLflow: it reads as the arm's name and has the colour of its place."""
     wanted = ORDER[place % len(ORDER)]
     return next((name for name in _readings(arm) if _hash(group(name)) % len(PALETTE) == wanted), arm)
 

@@ -51,7 +51,7 @@ class Greedy:
 
 
 class ServedPolicy(Greedy, PythonModel):
-    """What MLflow asks for. Methods in this class itself would have to have type hints that it can check."""
+    """The interface that MLflow asks for. Methods in this class itself would need type hints that it can check."""
 
 
 set_model(ServedPolicy())

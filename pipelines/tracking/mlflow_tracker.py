@@ -21,11 +21,10 @@ from typing import Any, NamedTuple
 
 from filelock import FileLock
 
-from pipelines.specs import safe_names as names
-from pipelines.tracking import arm_colours as legend
-from pipelines.tracking import saved_views as views
+from pipelines.specs import safe_names
+from pipelines.tracking import arm_colours, saved_views
 from pipelines.tracking.tracker import ADOPTED, VALUES_ONLY, Card, Recorded, Row, Status, StudyCard, unseen
-from pipelines.workspace import relocation as moved
+from pipelines.workspace import relocation
 from pipelines.workspace.addresses import fault, scrubbed, without_password
 from pipelines.workspace.best_effort import decoration
 from pipelines.workspace.errors import InputError
@@ -66,6 +65,11 @@ NOTE = "mlflow.note.content"  # the tag that MLflow shows as a description
 LONGEST = 8000  # characters of a run's tag
 MODULES = "modules"  # tag of a run: the digests of its code as JSON
 TRACE = "error.txt"  # a run's file with why it failed
+ARM = "arm"  # tag of a run; a run without it was logged by an older version
+OLDER = (
+    "the log holds runs of an older version (without the tag 'arm'), which are set aside: {}; `rhmc study run` trains "
+    "them anew"
+)
 ARMS = "arms"  # the experiment's tag with its arms as JSON, in the order in which they came: it decides their colours
 COLOURED = 100  # arms that the tag has room for; a view shows no more
 
@@ -96,7 +100,7 @@ class MlflowTracker:
     def __init__(self, study: StudyCard, home: Home, *, write: bool = True) -> None:
         self.study, self.home, self.uri = study, home, tracking_uri(home)
         self.remarks: list[str] = []  # what a person should know of this launch
-        self.own = moved.is_own(self.uri, home)
+        self.own = relocation.is_own(self.uri, home)
         with explained(self.uri):
             self.client = (writer if write else reader)(self.uri, home)
             self.experiment = self._experiment(home, write)
@@ -104,6 +108,8 @@ class MlflowTracker:
             self.parent = self._parent() if write else None
             if write:
                 self._interrupt_running()
+            if older := len(self._search(f"tags.role = 'run' and tags.{ARM} IS NULL")):
+                self.remarks.append(OLDER.format(older))
 
     def _experiment(self, home: Home, write: bool) -> str | None:
         name = experiment_name(self.study)
@@ -133,21 +139,18 @@ class MlflowTracker:
         arms = [*known, *(arm for arm in self.study.arms if arm not in known)][:COLOURED]
         if arms != known:
             self.client.set_experiment_tag(self.experiment, ARMS, json.dumps(arms, ensure_ascii=False))
-        for run in self._search(f"tags.role = 'run' and tags.{legend.TAG} IS NULL"):  # of an earlier version
-            look = self._look(run.data.tags.get("variant", ""), arms)
-            self.client.log_batch(run.info.run_id, tags=[RunTag(*pair) for pair in look])
         return arms
 
     @staticmethod
     def _look(arm: str, arms: Sequence[str]) -> list[tuple[str, str]]:
         """Tags that say how the runs of an arm are shown."""
         if arm not in arms:
-            return [(legend.TAG, arm)]
+            return [(arm_colours.TAG, arm)]
         place = arms.index(arm)
         try:
-            return [(legend.TAG, legend.legend(arm, place)), (legend.COLOUR, legend.colour(place))]
+            return [(arm_colours.TAG, arm_colours.legend(arm, place)), (arm_colours.COLOUR, arm_colours.colour(place))]
         except Exception:  # a colour never ends a launch; without one MLflow picks it
-            return [(legend.TAG, arm)]
+            return [(arm_colours.TAG, arm)]
 
     def _parent(self) -> str:
         ref = self._only("tags.role = 'study'", self.study.study, {"role": PARENT}).info.run_id
@@ -156,8 +159,8 @@ class MlflowTracker:
             self._describe(ref, self.study.note)
         with decoration(f"{self.study.study}: saved views in the log", _note):
             experiment = self.client.get_experiment(self.experiment)
-            legends = [dict(self._look(arm, self.arms))[legend.TAG] for arm in self.study.arms]
-            save_views(self.client, experiment, views.views(self.study.params, legends))
+            legends = [dict(self._look(arm, self.arms))[arm_colours.TAG] for arm in self.study.arms]
+            save_views(self.client, experiment, saved_views.views(self.study.params, legends))
         self.client.update_run(ref, "RUNNING")
         return ref
 
@@ -165,11 +168,11 @@ class MlflowTracker:
         """Show the note, with the saved views in its first paragraph: all that MLflow shows of it unasked."""
         assert self.experiment is not None
         first, gap, rest = note.partition("\n\n")
-        note = fitting(f"{first} {views.links(self.experiment)}{gap}{rest}")
+        note = fitting(f"{first} {saved_views.links(self.experiment)}{gap}{rest}")
         self.client.set_experiment_tag(self.experiment, NOTE, note)
         self.client.set_tag(ref, NOTE, note)
 
-    def _only(self, query: str, name: str, tags: dict[str, str], variant: str | None = None) -> Run:
+    def _only(self, query: str, name: str, tags: dict[str, str], arm: str | None = None) -> Run:
         """The one run that matches, made if there is none.
 
         A request whose answer is lost is sent again, and then a server that was killed may have made the run twice.
@@ -178,7 +181,7 @@ class MlflowTracker:
 
         def there() -> list[Run]:
             found = self._search(query)
-            return found if variant is None else [run for run in found if run.data.tags["variant"] == variant]
+            return found if arm is None else [run for run in found if run.data.tags.get(ARM) == arm]
 
         runs = there()
         if not runs:
@@ -223,13 +226,14 @@ class MlflowTracker:
         return {run.key: run.ref for run in runs if run.key in keys}
 
     def _listed(self, experiments: Sequence[str]) -> list[tuple[str, Recorded]]:
-        """Experiment and run of all runs there, oldest first."""
+        """Experiment and run of all runs there, oldest first; those of an older version are left out."""
         with explained(self.uri):
             sqlite = self.uri.startswith("sqlite:")
             return self._listed_sqlite(experiments) if sqlite else self._listed_client(experiments)
 
     def _listed_client(self, experiments: Sequence[str]) -> list[tuple[str, Recorded]]:
-        found = self._search("tags.role = 'run'", list(experiments)) if experiments else []
+        query = f"tags.role = 'run' and tags.{ARM} IS NOT NULL"
+        found = self._search(query, list(experiments)) if experiments else []
         return [(run.info.experiment_id, _recorded(run.info.run_id, run.info.status, run.data.tags)) for run in found]
 
     def _listed_sqlite(self, experiments: Sequence[str]) -> list[tuple[str, Recorded]]:
@@ -244,16 +248,18 @@ class MlflowTracker:
             for experiment, ref, status, key, value in database.execute(query, list(experiments)).fetchall():
                 runs.setdefault((str(experiment), ref, status), {})[key] = value
         return [
-            (e, _recorded(ref, status, tags)) for (e, ref, status), tags in runs.items() if tags.get("role") == "run"
+            (experiment, _recorded(ref, status, tags))
+            for (experiment, ref, status), tags in runs.items()
+            if tags.get("role") == "run" and ARM in tags
         ]
 
     def mark(self, ref: str, *, stale: bool) -> None:
         """See `Tracker`."""
         with explained(self.uri):
             if stale:
-                self.client.set_tag(ref, views.STALE, "yes")
+                self.client.set_tag(ref, saved_views.STALE, "yes")
             else:
-                self.client.delete_tag(ref, views.STALE)
+                self.client.delete_tag(ref, saved_views.STALE)
 
     def start(self, card: Card) -> "MlflowRun":
         """See `Tracker`."""
@@ -287,7 +293,7 @@ class MlflowTracker:
             | {
                 "role": "run",
                 "mlflow.parentRunId": self.parent or "",
-                "variant": card.arm,
+                ARM: card.arm,
                 "algorithm": card.algorithm,
                 "task": card.task,
                 "seed": str(card.seed),
@@ -311,7 +317,7 @@ class MlflowTracker:
 
         first: dict[tuple[str, int, str], float] = {}
         for one in Histories(self.client, self.uri).of(self._runs(refs), keys_of(metrics)):
-            first.setdefault((one.ref, one.step, names.full(one.metric)), one.value)
+            first.setdefault((one.ref, one.step, safe_names.full(one.metric)), one.value)
         return (Row(*place, value) for place, value in first.items())
 
     def _runs(self, refs: Sequence[str]) -> Iterator[Run]:
@@ -328,7 +334,7 @@ class MlflowTracker:
             for ref in refs:
                 first: dict[tuple[int, str], float] = {}
                 for step, key, value, is_nan in database.execute(query, (ref, *keys)).fetchall():  # let writers in
-                    first.setdefault((step, names.full(key)), float("nan") if is_nan else value)
+                    first.setdefault((step, safe_names.full(key)), float("nan") if is_nan else value)
                 yield from (Row(ref, *place, value) for place, value in first.items())
 
     def publish(self, note: str, files: Mapping[str, bytes]) -> None:
@@ -360,24 +366,24 @@ class MlflowTracker:
             return _copied(self.keeps(ref), name, folder)
 
     def files_of(self, ref: str) -> str:
-        """Where the files of a run are looked for."""
+        """The place where the files of a run are looked for."""
         with explained(self.uri):
             stored = self.client.get_run(ref).info.artifact_uri
-            return str(moved.run_folder(stored, self.home, own=self.own) or stored)
+            return str(relocation.run_folder(stored, self.home, own=self.own) or stored)
 
     def keeps(self, ref: str) -> ArtifactRepository:
         """The files of a run, where they are now."""
         stored = self.client.get_run(ref).info.artifact_uri
-        there = moved.run_folder(stored, self.home, own=self.own)
+        there = relocation.run_folder(stored, self.home, own=self.own)
         return get_artifact_repository(there.as_uri() if there else stored, tracking_uri=self.uri)
 
     def where(self) -> str:
-        """How to look at the experiment: a command, or a server's address."""
+        """The way to look at the experiment: a command, or a server's address."""
         return without_password(self.uri) if self.served else "rhmc ui"
 
     @property
     def served(self) -> bool:
-        """Whether a server keeps the log, and its files."""
+        """True if a server keeps the log, and its files."""
         return self.uri.startswith(SERVER)
 
 
@@ -391,7 +397,9 @@ class MlflowRun:
     def log(self, points: Sequence[Metrics]) -> None:
         """See `RunLog`."""
         now = int(time.time() * 1000)
-        values = [Metric(names.shown(metric), value, now, step) for metric, step, value in unseen(points, self.seen)]
+        values = [
+            Metric(safe_names.shown(metric), value, now, step) for metric, step, value in unseen(points, self.seen)
+        ]
         with explained(self.uri):
             for start in range(0, len(values), BATCH):
                 self.client.log_batch(self.ref, metrics=values[start : start + BATCH])
@@ -438,7 +446,7 @@ class MlflowRun:
         Where a server keeps the files, that is its business.
         """
         tracker = self.tracker
-        folder = moved.run_folder(self.client.get_run(self.ref).info.artifact_uri, tracker.home, own=tracker.own)
+        folder = relocation.run_folder(self.client.get_run(self.ref).info.artifact_uri, tracker.home, own=tracker.own)
         if folder and folder.is_dir():
             for path in (*folder.rglob("*"), folder, *list(folder.parents)[:3]):
                 sync(path)
@@ -455,8 +463,8 @@ def fitting(note: str) -> str:
 
 
 def keys_of(metrics: Collection[str] | None) -> set[str] | None:
-    """What metrics of the program may be called in MLflow; None for all."""
-    return None if metrics is None else {name for metric in metrics for name in (metric, names.shown(metric))}
+    """The names that metrics of the program may have in MLflow; None for all."""
+    return None if metrics is None else {name for metric in metrics for name in (metric, safe_names.shown(metric))}
 
 
 def addresses(uri: str, server: str) -> list[tuple[str, str, str]]:
@@ -477,8 +485,8 @@ def addresses(uri: str, server: str) -> list[tuple[str, str, str]]:
     return [(e.name, view.name, f"{server}/#/experiments/{e.experiment_id}/runs?{view.query}") for e, view in found]
 
 
-def _views_of(client: MlflowClient, experiment: Experiment) -> list[views.View]:
-    there = views.views({})
+def _views_of(client: MlflowClient, experiment: Experiment) -> list[saved_views.View]:
+    there = saved_views.views({})
     if all(view.tag in experiment.tags for view in there):
         return there
     runs = client.search_runs([experiment.experiment_id], "tags.role = 'run'", max_results=100)
@@ -486,12 +494,12 @@ def _views_of(client: MlflowClient, experiment: Experiment) -> list[views.View]:
     for run in runs:
         mine = params[run.data.params.get("method", "")]
         mine += [name for name in run.data.params if name not in (*mine, "method")]
-    wanted = views.views(params)
+    wanted = saved_views.views(params)
     save_views(client, experiment, wanted)
     return wanted
 
 
-def save_views(client: MlflowClient, experiment: Experiment, wanted: Sequence[views.View]) -> None:
+def save_views(client: MlflowClient, experiment: Experiment, wanted: Sequence[saved_views.View]) -> None:
     """Write the saved views of an experiment where they are not as they should be."""
     for view in wanted:
         written = view.written(experiment.creation_time or 0)
@@ -559,7 +567,7 @@ def open_existing(study: StudyCard, home: Home) -> MlflowTracker | None:
 
 
 def _empty(file: Path) -> bool:
-    """Whether there is no database yet; a device or a pipe in its place is none and never will be."""
+    """True if there is no database yet; a device or a pipe in its place is none and never will be."""
     return not file.exists() or (file.is_file() and file.stat().st_size == 0)
 
 
@@ -574,7 +582,7 @@ def prepared(home: Home) -> str:
     quieten()
     with explained(uri):
         if not (uri.startswith("sqlite:") and sqlite_file(uri).stat().st_size == 0):
-            moved.bring_up_to_date(uri, home)
+            relocation.bring_up_to_date(uri, home)
     return uri
 
 
@@ -584,7 +592,7 @@ def writer(uri: str, home: Home) -> MlflowClient:
     quieten()
     if uri.startswith("sqlite:"):
         create_database(sqlite_file(uri))
-    moved.bring_up_to_date(uri, home)
+    relocation.bring_up_to_date(uri, home)
     return MlflowClient(uri, uri)
 
 
@@ -611,15 +619,15 @@ def reader(uri: str, home: Home) -> MlflowClient:
 def _recorded(ref: str, status: str, tags: Mapping[str, str]) -> Recorded:
     known: dict[str, str] = defaultdict(str, tags)
     key = f"{known['spec']}-{known['fingerprint']}"
-    stale, host = views.STALE in tags, Host(known["machine"], known["versions"])
+    stale, host = saved_views.STALE in tags, Host(known["machine"], known["versions"])
     modules: Mapping[str, str] = json.loads(known[MODULES] or "{}")
     return Recorded(
-        *(ref, known["variant"], key, FROM_MLFLOW[status], known["commit"], stale, host, known["error"]),
+        *(ref, known[ARM], key, FROM_MLFLOW[status], known["commit"], stale, host, known["error"]),
         *(VALUES_ONLY in tags, modules, known[ADOPTED]),
     )
 
 
-# What may be in the way
+# Environment errors
 
 
 # MLflow makes the folders of a SQLite address as it is written, with %20 for a space. Ours are there.

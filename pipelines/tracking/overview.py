@@ -1,4 +1,4 @@
-"""What the parent run of a study shows: its question and arms, the results so far, their curves and table.
+"""The content of a study's parent run: its question and arms, the results so far, their curves and table.
 
 Means and ranges over seeds only, to look at while a study runs. Intervals and verdicts are the report's.
 """
@@ -11,7 +11,7 @@ from io import BytesIO, StringIO
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from pipelines.tracking import arm_colours as legend
+from pipelines.tracking import arm_colours
 from pipelines.tracking.plan import LISTED, Item, more
 from pipelines.tracking.tracker import Recorded, Row, Status, StudyCard, Tracker
 from pipelines.workspace.best_effort import decoration
@@ -36,7 +36,7 @@ Point = tuple[int, float]  # step, value
 
 
 class Run(NamedTuple):
-    """What is shown of one run."""
+    """The part of a run that is shown."""
 
     arm: str
     seed: int
@@ -196,11 +196,11 @@ def figure(study: StudyCard, runs: Sequence[Run]) -> bytes:
     """
     from matplotlib import rc_context  # 1 s, and only where something is finished
 
-    from reports.render import glyphs as letters
+    from reports.render import glyphs
 
-    with rc_context(letters.settings()):
+    with rc_context(glyphs.settings()):
         sheet = _drawn(study, runs)
-        letters.settle(sheet)
+        glyphs.settle(sheet)
         out = BytesIO()
         sheet.savefig(out, format="png", dpi=110, metadata={"Software": None})
     return out.getvalue()
@@ -212,8 +212,8 @@ def _drawn(study: StudyCard, runs: Sequence[Run]) -> "Figure":
 
     sheet = Figure(figsize=(8, 4.5), layout="constrained")
     FigureCanvasAgg(sheet)
-    axes = sheet.add_subplot(xlabel="environment steps", ylabel="return of the evaluation bank")
-    axes.set_prop_cycle(color=[legend.colour(place) for place in range(MOST)])
+    axes = sheet.add_subplot(xlabel="environment steps", ylabel="return in evaluation episodes")
+    axes.set_prop_cycle(color=[arm_colours.colour(place) for place in range(MOST)])
     curves = {arm: found for arm, mine in by_arm(runs).items() if (found := _common(mine))}
     lines, names = [], []  # named in the legend by hand: of itself it leaves out what begins with `_`
     for arm, (seeds, steps, values) in list(curves.items())[:MOST]:
@@ -229,7 +229,7 @@ def _drawn(study: StudyCard, runs: Sequence[Run]) -> "Figure":
 
 
 def _common(mine: Sequence[Run]) -> tuple[int, list[int], list[list[float]]] | None:
-    """How many runs, the steps that all of them have, and their values there."""
+    """The number of runs, the steps that all of them have, and their values there."""
     begun = [run for run in mine if run.curve]
     curves = [dict(run.curve) for run in begun if run.status == "finished"] or [dict(run.curve) for run in begun]
     if not curves:

@@ -1,4 +1,4 @@
-"""What a study asks for, set against what is there."""
+"""The runs that a study plans, compared with those that exist."""
 
 import json
 import os
@@ -35,7 +35,7 @@ class Item(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What a person calls it."""
+        """The name for people."""
         return f"{self.study} / {self.card.arm} s{self.card.seed}"
 
     @property
@@ -125,7 +125,7 @@ def study_card(study: Study) -> StudyCard:
 
 
 def _varying(specs: Sequence[RunSpec]) -> dict[str, list[str]]:
-    """What varies between runs, as far as the runs of each method have it."""
+    """The settings that vary between runs, as far as the runs of each method have it."""
     names = [name for name in what_varies(specs) if name != KIND]
     flats = {spec.algo.kind: flatten(spec.model_dump(mode="json")) for spec in specs}
     return {method: [name for name in names if name in flat] for method, flat in flats.items()}
@@ -137,7 +137,7 @@ def more(arms: Sequence[str]) -> list[str]:
 
 
 def _differs(study: Study, arm: str) -> str:
-    """What an arm changes in the base, as code."""
+    """The changes of an arm in the base, as code."""
     found = changes(study.base, study.arms[arm])
     return ", ".join(code(f"{name}={value}") for name, value in found.items()) or "the base"
 
@@ -201,7 +201,7 @@ def read_commit(where: Path = Path(__file__).parent) -> Commit:
 
 
 def _said(words: str, where: Path) -> str:
-    """What git wrote, and what helps, on one line."""
+    """The message of git, and the remedy, on one line."""
     lines = [line.strip() for line in words.splitlines() if line.strip()]
     remedy = [line for line in lines if line.startswith("git config ")]
     text = f"git in {where}: {lines[0].removeprefix('fatal: ')}" if lines else f"git failed in {where}"

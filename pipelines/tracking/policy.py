@@ -27,7 +27,7 @@ class NoPolicyError(InputError):
 
 
 class Saved(NamedTuple):
-    """What a file of a run holds."""
+    """The content of a policy's file."""
 
     spec: RunSpec
     algorithm: State

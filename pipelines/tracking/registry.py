@@ -56,13 +56,13 @@ def register(client: MlflowClient, run: str, experiment: str, study: StudyCard, 
         policy: its file.
     """
     name = model_name(study, card.arm)
-    tags = {"study": study.study, "profile": study.profile, "variant": card.arm, "seed": str(card.seed)}
+    tags = {"study": study.study, "profile": study.profile, "arm": card.arm, "seed": str(card.seed)}
     tags |= {"spec": card.spec_id, "fingerprint": card.fingerprint, "commit": card.commit}
     made = _registered(client, run, name)
     if made is None:
         model = _logged(client, run, experiment, name.replace(".", "_"), tags, policy)
         try:
-            client.create_registered_model(name, tags={k: tags[k] for k in ("study", "profile", "variant")})
+            client.create_registered_model(name, tags={k: tags[k] for k in ("study", "profile", "arm")})
         except MlflowException as error:
             if error.error_code != "RESOURCE_ALREADY_EXISTS":
                 raise

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from pipelines.specs.safe_names import HEADLINES
-from pipelines.tracking import arm_colours as legend
+from pipelines.tracking import arm_colours
 
 TAG = "mlflow.sharedViewState."
 STALE = "stale"  # the tag of runs that the latest plan of the study is without: other steps, other code
@@ -55,7 +55,7 @@ class View(NamedTuple):
 
     @property
     def query(self) -> str:
-        """What opens it, after `#/experiments/<id>/runs?`."""
+        """The query that opens it, after `#/experiments/<id>/runs?`."""
         return f"workflowType=machine_learning&viewStateShareKey={self.key}&compareRunsMode={self.mode}"
 
     def written(self, created: int) -> str:
@@ -73,10 +73,10 @@ def views(params: Params, legends: Sequence[str] = ()) -> list[View]:
         legends: of its arms, which the table shows as a line each. Without them runs are grouped by their arms' names.
     """
     legends = legends[:SHOWN]
-    base, tag = _base(params, legends), legend.TAG if legends else "variant"
+    base, tag = _base(params, legends), arm_colours.TAG if legends else "arm"
     grouped = base | {
         "groupBy": {"aggregateFunction": "average", "groupByKeys": [{"mode": "tag", "groupByData": tag}]},
-        "groupsExpanded": {legend.group(name): False for name in legends},
+        "groupsExpanded": {arm_colours.group(name): False for name in legends},
     }
     return [
         View("rhmc-curves", "Curves by arm", "CHART", grouped | _curves()),
@@ -112,7 +112,7 @@ def _base(params: Params, legends: Sequence[str]) -> State:
 
 
 def _names(params: Params) -> list[str]:
-    """What varies in any kind of run."""
+    """The columns that vary in any kind of run."""
     return list(dict.fromkeys(name for names in params.values() for name in names))
 
 

@@ -1,4 +1,4 @@
-"""Why a run is stale: which of its settings, or which modules of its code, are other than the plan's."""
+"""The reason why a run is stale: which of its settings, or which modules of its code, are other than the plan's."""
 
 from collections import Counter
 from collections.abc import Iterable, Sequence

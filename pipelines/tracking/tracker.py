@@ -1,4 +1,4 @@
-"""Where runs are logged: the protocol, and a twin in memory that obeys it.
+"""The log of runs: the protocol, and a twin in memory that obeys it.
 
 A run in a log is named by study, profile, arm and key (spec id and code fingerprint). Starting one that is there
 already continues it, unless it came from elsewhere (`Card.imported`): values of two machines do not meet in one run. A
@@ -47,12 +47,12 @@ class Card(NamedTuple):
 
     @property
     def key(self) -> str:
-        """What was trained: spec id and fingerprint."""
+        """The identity of what was trained: spec id and fingerprint."""
         return f"{self.spec_id}-{self.fingerprint}"
 
     @property
     def name(self) -> str:
-        """What a person calls it."""
+        """The name for people."""
         return f"{self.arm} s{self.seed}" if self.trial is None else f"{self.arm} t{self.trial}"
 
 
@@ -144,7 +144,7 @@ class Tracker(Protocol):
         ...
 
     def files_of(self, ref: str) -> str:
-        """Where the files of a run are looked for, for a person."""
+        """The place where the files of a run are looked for, for people."""
         ...
 
     def publish(self, note: str, files: Mapping[str, bytes]) -> None:

@@ -1,4 +1,4 @@
-"""The winner of a search as a file that a study includes: `algo: {include: found/search_rhmc.rhmc.paper.yaml}`.
+"""The winner of a search as a file that a study includes: `algo: {include: best_params/search_rhmc.rhmc.paper.yaml}`.
 
 The same search gives the same bytes: no clock, no path of this machine.
 """
@@ -37,7 +37,7 @@ def winner_yaml(search: Search, arm: str, best: Best, counts: dict[str, int]) ->
     yaml = YAML()
     yaml.width = 1000
     yaml.dump(document, out)
-    head = f"# Written by `rhmc search run`. In a study: algo: {{include: found/{file_name(search, arm)}}}\n"
+    head = f"# Written by `rhmc search run`. In a study: algo: {{include: best_params/{file_name(search, arm)}}}\n"
     return head + out.getvalue()
 
 
@@ -58,8 +58,8 @@ def _provenance(search: Search, arm: str, best: Best, counts: dict[str, int]) ->
         "task": {"kind": env.kind} | env.model_dump(mode="json", exclude_defaults=True),
         "trainer": search.arms[arm].setting.trainer.model_dump(mode="json"),
         "best": {
-            "trial": best.place,
-            "found": dict(best.params),
+            "trial": best.trial_index,
+            "params": dict(best.params),
             "objective": f"mean of {OBJECTIVE} over the seeds",
             "value": best.value,
             "seeds": dict(zip(search.seed_list(), best.returns, strict=True)),

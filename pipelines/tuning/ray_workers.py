@@ -23,7 +23,7 @@ from rhmc.types import Metrics
 
 
 class TrialJob(Job):
-    """What a worker gets. `spec` is the setting alone."""
+    """The input of a worker. `spec` is the setting alone."""
 
     seeds: list[int]
 

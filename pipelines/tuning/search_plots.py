@@ -11,7 +11,7 @@ from optuna.exceptions import ExperimentalWarning
 from optuna.trial import TrialState
 
 from pipelines.workspace.work_folder import StoreError
-from reports.render import glyphs as letters
+from reports.render import glyphs
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -36,7 +36,7 @@ def plots(study: optuna.Study, title: str, stem: Path) -> list[Path]:
     if len({trial.value for trial in done}) < 2:
         wanted.pop("importance", None)  # nothing to explain
     files = []
-    with warnings.catch_warnings(), matplotlib.rc_context(letters.settings()):  # Optuna sets a style for everyone
+    with warnings.catch_warnings(), matplotlib.rc_context(glyphs.settings()):  # Optuna sets a style for everyone
         warnings.simplefilter("ignore", ExperimentalWarning)
         for name, draw in wanted.items():
             axes = draw(study)
@@ -50,7 +50,7 @@ def plots(study: optuna.Study, title: str, stem: Path) -> list[Path]:
 def _save(figure: Any, path: Path) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        letters.settle(figure)
+        glyphs.settle(figure)
         figure.savefig(path, dpi=120, bbox_inches="tight")
     except OSError as error:
         raise StoreError(f"{path}: cannot be written: {error.strerror or error}") from error

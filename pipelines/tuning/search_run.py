@@ -25,7 +25,7 @@ from pipelines.specs.source_file import another, remember
 from pipelines.tracking.plan import read_commit
 from pipelines.tracking.tracker import Card, RunLog, Status, StudyCard, Tracker
 from pipelines.tuning.best_params import file_name, stem, winner_yaml, write_text
-from pipelines.tuning.trials import OBJECTIVE, Asked, BaseStorage, Ledger, explained, look, opened, storage_url
+from pipelines.tuning.trials import OBJECTIVE, ArmStudy, BaseStorage, TrialRequest, explained, look, opened, storage_url
 from pipelines.workspace.addresses import without_password
 from pipelines.workspace.best_effort import decoration
 from pipelines.workspace.errors import InputError, visible
@@ -42,7 +42,7 @@ PATIENCE = 1.0  # seconds between two looks at whether Ctrl-C was pressed
 
 
 class Workers(Protocol):
-    """Who trains. See `pool.Pool`."""
+    """Processes that train trials, see `ray_workers.Pool`."""
 
     @property
     def free(self) -> int: ...
@@ -62,17 +62,17 @@ def run_search(search: Search, home: Path, out: Path | None = None) -> int:
     Args:
         search: the plan.
         home: the work folder.
-        out: where the winners go; `found` beside the search's file if None, and the work folder where the search was
-            changed by overrides: a trial of the tool does not replace what was found in earnest.
+        out: the folder of the best settings; `best_params` beside the search's file if None. The work folder where
+            the search was changed by overrides: a trial of the tool does not replace the result of a real search.
 
     Returns:
-        0 every trial is finished or pruned, 1 some failed, 2 something is in the way, 130 interrupted, 143 terminated.
+        0 every trial is finished or pruned, 1 some failed, 2 environment error, 130 interrupted, 143 terminated.
     """
 
     def launch(place: Home, interrupts: Interrupts) -> int:
         with opened(place) as storage:
             assert storage is not None
-            return _launch(search, place, storage, out or found_folder(search, place), interrupts)
+            return _launch(search, place, storage, out or best_params_folder(search, place), interrupts)
 
     devices = {arm.setting.trainer.device: name for name, arm in search.arms.items()}
     if faults := list(missing_devices(devices.items())):
@@ -82,13 +82,13 @@ def run_search(search: Search, home: Path, out: Path | None = None) -> int:
     return guarded(home, [(search.name, search.profile)], launch)
 
 
-def found_folder(search: Search, home: Home) -> Path:
-    """Where the winners go."""
-    return plots_folder(search, home) / "found" if search.overrides else Path(search.file).parent / "found"
+def best_params_folder(search: Search, home: Home) -> Path:
+    """The folder of the best settings."""
+    return plots_folder(search, home) / "best_params" if search.overrides else Path(search.file).parent / "best_params"
 
 
 def plots_folder(search: Search, home: Home) -> Path:
-    """Where the plots go."""
+    """The folder of the plots."""
     return home.root / "searches" / f"{search.name}-{search.profile}"
 
 
@@ -105,32 +105,36 @@ def _launch(search: Search, home: Home, storage: BaseStorage, out: Path, interru
             remember(home, search.name, search.profile, search.file)
             for remark in tracker.remarks:
                 display.say(remark)
-            ledgers = [Ledger(search, arm, storage) for arm in search.arms]
-            for ledger in ledgers:
-                again = ledger.take_up()
-                _clear(search, ledger, home)
-                display.say(f"{ledger.arm}: {ledger.closed} of {search.trials} trials are done, {again} are taken up")
-            if any(ledger.left for ledger in ledgers):
-                _train(search, ledgers, Book(search, tracker, display), home, interrupts)
-            whole = not any(ledger.left or ledger.live for ledger in ledgers)
-            for ledger in ledgers if not whole else []:
-                ledger.take_up()
-            written = results(search, ledgers, tracker, home, out if whole else None, display.say)
-        failed = any(ledger.counts()["failed"] for ledger in ledgers)
+            arm_studies = [ArmStudy(search, arm, storage) for arm in search.arms]
+            for arm_study in arm_studies:
+                again = arm_study.take_up()
+                _clear(search, arm_study, home)
+                display.say(
+                    f"{arm_study.arm}: {arm_study.closed} of {search.trials} trials are done, {again} are taken up"
+                )
+            if any(arm_study.left for arm_study in arm_studies):
+                _train(search, arm_studies, TrialLog(search, tracker, display), home, interrupts)
+            whole = not any(arm_study.left or arm_study.live for arm_study in arm_studies)
+            for arm_study in arm_studies if not whole else []:
+                arm_study.take_up()
+            written = results(search, arm_studies, tracker, home, out if whole else None, display.say)
+        failed = any(arm_study.counts()["failed"] for arm_study in arm_studies)
         status = "interrupted" if not whole else "failed" if failed else "finished"
     finally:
         tracker.close(status)
-    _summary(search, ledgers, tracker, written, whole)
+    _summary(search, arm_studies, tracker, written, whole)
     return {"finished": DONE, "failed": FAILED}.get(status, interrupts.code)
 
 
-def _clear(search: Search, ledger: Ledger, home: Home) -> None:
+def _clear(search: Search, arm_study: ArmStudy, home: Home) -> None:
     """Remove what a launch left that was killed between closing a trial and removing its checkpoints."""
-    for asked in ledger.over():
-        Checkpoints(home.checkpoints(trial_card(search, asked, "").key)).clear_unused()
+    for request in arm_study.over():
+        Checkpoints(home.checkpoints(trial_card(search, request, "").key)).clear_unused()
 
 
-def _train(search: Search, ledgers: Sequence[Ledger], book: "Book", home: Home, interrupts: Interrupts) -> None:
+def _train(
+    search: Search, arm_studies: Sequence[ArmStudy], trial_log: "TrialLog", home: Home, interrupts: Interrupts
+) -> None:
     set_up_ray()
     from pipelines.execution.ray_driver import ray_session  # 3 s
     from pipelines.tuning.ray_workers import Pool
@@ -144,8 +148,8 @@ def _train(search: Search, ledgers: Sequence[Ledger], book: "Book", home: Home, 
     try:
         with session as remarks, interrupts.go_to(stop):
             for remark in remarks:
-                book.board.say(remark)
-            Drive(search, ledgers, Pool(resources.concurrent, resources.cpus), book, home, stop).run()
+                trial_log.board.say(remark)
+            Drive(search, arm_studies, Pool(resources.concurrent, resources.cpus), trial_log, home, stop).run()
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
 
@@ -154,8 +158,8 @@ def _train(search: Search, ledgers: Sequence[Ledger], book: "Book", home: Home, 
 class Running:
     """A trial that is being trained."""
 
-    ledger: Ledger
-    asked: Asked
+    arm_study: ArmStudy
+    request: TrialRequest
     folder: Path  # of its checkpoints
     points: int = 0  # of its curve so far
 
@@ -165,18 +169,24 @@ class Drive:
 
     Args:
         search: the plan.
-        ledgers: of every arm.
-        pool: who trains.
-        book: the log.
+        arm_studies: of every arm.
+        pool: the workers.
+        trial_log: the log.
         home: where checkpoints lie.
         stop: a file: once it exists, nothing new begins, and each trial saves itself at its next point.
     """
 
     def __init__(
-        self, search: Search, ledgers: Sequence[Ledger], pool: Workers, book: "Book", home: Home, stop: Path
+        self,
+        search: Search,
+        arm_studies: Sequence[ArmStudy],
+        pool: Workers,
+        trial_log: "TrialLog",
+        home: Home,
+        stop: Path,
     ) -> None:
-        self.search, self.ledgers, self.pool, self.book = search, ledgers, pool, book
-        self.home, self.stop = home, StopFile(stop, book.board)
+        self.search, self.arm_studies, self.pool, self.trial_log = search, arm_studies, pool, trial_log
+        self.home, self.stop = home, StopFile(stop, trial_log.board)
         self.running: dict[str, Running] = {}
 
     def run(self) -> None:
@@ -190,21 +200,21 @@ class Drive:
     def _fill(self) -> None:
         """Keep every worker busy; the arm that has most left to try goes first, so that all advance together."""
         while not self.stop.exists() and self.pool.free:  # looked for first: it is announced while all are busy too
-            ledger = max(self.ledgers, key=lambda one: one.left)
-            if not ledger.left:
+            arm_study = max(self.arm_studies, key=lambda one: one.left)
+            if not arm_study.left:
                 return
-            asked = ledger.ask()
-            if asked is not None:
-                self._begin(ledger, asked)
+            request = arm_study.ask()
+            if request is not None:
+                self._begin(arm_study, request)
 
-    def _begin(self, ledger: Ledger, asked: Asked) -> None:
-        key = self.book.start(asked)
+    def _begin(self, arm_study: ArmStudy, request: TrialRequest) -> None:
+        key = self.trial_log.start(request)
         folder = self.home.checkpoints(key)
-        self.running[key] = Running(ledger, asked, folder)
+        self.running[key] = Running(arm_study, request, folder)
         self.pool.begin(
             {
                 "key": key,
-                "spec": asked.setting.canonical(),
+                "spec": request.setting.canonical(),
                 "seeds": self.search.seed_list(),
                 "folder": str(folder),
                 "checkpoint_every": self.search.resources.checkpoint_every,
@@ -213,15 +223,15 @@ class Drive:
         )
 
     def _take(self, key: str, result: "dict[str, Any] | Failed") -> None:
-        """What a worker reports of a trial."""
+        """Take in what a worker reports of a trial."""
         one = self.running[key]
         if not isinstance(result, dict):
             self._end(key)
-            self.book.fail(key, one.asked, result.error, result.trace)
-            one.ledger.fail(one.asked, result.error)
+            self.trial_log.fail(key, one.request, result.error, result.trace)
+            one.arm_study.fail(one.request, result.error)
             return
         if "died" in result:
-            self.book.died(one.asked)
+            self.trial_log.died(one.request)
             return
         if why := self._points(key, one, result["points"]):
             self._give_up(key, one, why)
@@ -229,7 +239,7 @@ class Drive:
             self._give_up(key, one, result["error"], "failed")
         elif result["stopped"]:
             self._end(key)
-            self.book.interrupt(key, one.asked)
+            self.trial_log.interrupt(key, one.request)
         elif result["done"]:
             self._end(key)
             self._complete(key, one, result["points"][-1])
@@ -239,8 +249,8 @@ class Drive:
     def _give_up(self, key: str, one: Running, why: str, status: Status = "finished") -> None:
         """Prune a trial; `status` is that of its log."""
         self._end(key)
-        self.book.prune(key, one.asked, why, status)
-        one.ledger.prune(one.asked, why)
+        self.trial_log.prune(key, one.request, why, status)
+        one.arm_study.prune(one.request, why)
         Checkpoints(one.folder).clear()
 
     def _points(self, key: str, one: Running, points: Sequence[Metrics]) -> str:
@@ -250,8 +260,8 @@ class Drive:
             Why the trial should be given up; nothing if it should not.
         """
         for point in points:
-            why = one.ledger.report(one.asked, point, one.points)
-            self.book.points(key, one.asked, [point])
+            why = one.arm_study.report(one.request, point, one.points)
+            self.trial_log.points(key, one.request, [point])
             one.points += 1
             if why:
                 return why
@@ -259,8 +269,8 @@ class Drive:
 
     def _complete(self, key: str, one: Running, last: Metrics) -> None:
         returns = [last[f"seeds/{seed}"] for seed in self.search.seed_list()]
-        self.book.complete(key, one.asked, last["step"], math.fsum(returns) / len(returns))
-        one.ledger.complete(one.asked, returns)
+        self.trial_log.complete(key, one.request, last["step"], math.fsum(returns) / len(returns))
+        one.arm_study.complete(one.request, returns)
         Checkpoints(one.folder).clear()
 
     def _end(self, key: str) -> None:
@@ -271,7 +281,7 @@ class Drive:
 # The log
 
 
-class Book:
+class TrialLog:
     """Keeps the log and the board in step with the trials: a run for each, its curve the mean over the seeds.
 
     Args:
@@ -287,69 +297,83 @@ class Book:
             display.say(f"the commit is logged as unknown: {why}")
         self.logs: dict[str, RunLog] = {}
 
-    def start(self, asked: Asked) -> str:
+    def start(self, request: TrialRequest) -> str:
         """A trial begins or continues; returns its key, which names it in the log and in the checkpoints."""
-        card = trial_card(self.search, asked, self.commit)
+        card = trial_card(self.search, request, self.commit)
         log = self.logs[card.key] = self.tracker.start(card)
-        log.tag("trial", str(asked.place))
-        log.text("config.yaml", self._yaml(asked, card))
-        self.board.start(self._name(asked), self.search.steps)
+        log.tag("trial", str(request.trial_index))
+        log.text("config.yaml", self._yaml(request, card))
+        self.board.start(self._name(request), self.search.steps)
         return card.key
 
-    def _yaml(self, asked: Asked, card: Card) -> str:
-        head = {"search": self.search.name, "profile": self.search.profile, "arm": asked.arm, "trial": asked.place}
+    def _yaml(self, request: TrialRequest, card: Card) -> str:
+        head = {
+            "search": self.search.name,
+            "profile": self.search.profile,
+            "arm": request.arm,
+            "trial": request.trial_index,
+        }
         names = {"fingerprint": card.fingerprint, "commit": card.commit, "seeds": self.search.seed_list()}
         out = StringIO()
-        YAML().dump(head | names | asked.setting.model_dump(mode="json"), out)
+        YAML().dump(head | names | request.setting.model_dump(mode="json"), out)
         return out.getvalue()
 
-    def points(self, key: str, asked: Asked, points: list[Metrics]) -> None:
+    def points(self, key: str, request: TrialRequest, points: list[Metrics]) -> None:
         """New points of a trial's curve."""
         self.logs[key].log(points)
-        self.board.points(self._name(asked), points)
+        self.board.points(self._name(request), points)
 
-    def complete(self, key: str, asked: Asked, step: float, value: float) -> None:
+    def complete(self, key: str, request: TrialRequest, step: float, value: float) -> None:
         """A trial ended: its value is the metric `objective`, which a pruned one has not."""
         self.logs[key].log([{"step": step, "objective": value}])
-        self._end(key, asked, "complete", "finished", f"objective {value:.2f}")
+        self._end(key, request, "complete", "finished", f"objective {value:.2f}")
 
-    def prune(self, key: str, asked: Asked, why: str, status: Status) -> None:
+    def prune(self, key: str, request: TrialRequest, why: str, status: Status) -> None:
         """A trial is given up."""
         if status == "failed":
             self.logs[key].tag("error", why)
-        self._end(key, asked, "pruned", status, f"pruned, {why}")
+        self._end(key, request, "pruned", status, f"pruned, {why}")
 
-    def interrupt(self, key: str, asked: Asked) -> None:
+    def interrupt(self, key: str, request: TrialRequest) -> None:
         """A trial saved itself for the next launch."""
-        self._end(key, asked, "interrupted", "interrupted", "stopped; the next launch continues it")
+        self._end(key, request, "interrupted", "interrupted", "stopped; the next launch continues it")
 
-    def died(self, asked: Asked) -> None:
+    def died(self, request: TrialRequest) -> None:
         """The process that trained a trial is gone; another one continues it."""
-        self.board.say(f"{self._name(asked)}: its worker died; another one continues it")
+        self.board.say(f"{self._name(request)}: its worker died; another one continues it")
 
-    def fail(self, key: str, asked: Asked, error: str, trace: str) -> None:
+    def fail(self, key: str, request: TrialRequest, error: str, trace: str) -> None:
         """A trial raised: keep why, go on with the others."""
         self.logs[key].tag("error", error)
         self.logs[key].text("error.txt", trace)
-        self._end(key, asked, "failed", "failed", f"failed: {error}")
+        self._end(key, request, "failed", "failed", f"failed: {error}")
 
-    def _end(self, key: str, asked: Asked, state: str, status: Status, text: str) -> None:
+    def _end(self, key: str, request: TrialRequest, state: str, status: Status, text: str) -> None:
         log = self.logs.pop(key)
         log.tag("state", state)
         log.finish(status)
-        self.board.end(self._name(asked), text)
+        self.board.end(self._name(request), text)
 
-    def _name(self, asked: Asked) -> str:
-        return f"{self.search.name} / {asked.name}"
+    def _name(self, request: TrialRequest) -> str:
+        return f"{self.search.name} / {request.name}"
 
 
-def trial_card(search: Search, asked: Asked, commit: str) -> Card:
+def trial_card(search: Search, request: TrialRequest, commit: str) -> Card:
     """A trial as its log shows it. Two trials with the same values are two runs."""
-    parts = (asked.setting.stated(), str(search.seed_list()), str(asked.place), search.identity(asked.arm))
+    parts = (request.setting.stated(), str(search.seed_list()), str(request.trial_index), search.identity(request.arm))
     spec_id = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:12]
-    kinds = asked.setting.algo.kind, asked.setting.env.kind
-    params = {"method": kinds[0]} | {f"algo.{name}": str(value) for name, value in asked.params.items()}
-    return Card(asked.arm, search.seed_list()[0], spec_id, search.code(asked.arm), *kinds, commit, params, asked.place)
+    kinds = request.setting.algo.kind, request.setting.env.kind
+    params = {"method": kinds[0]} | {f"algo.{name}": str(value) for name, value in request.params.items()}
+    return Card(
+        request.arm,
+        search.seed_list()[0],
+        spec_id,
+        search.code(request.arm),
+        *kinds,
+        commit,
+        params,
+        request.trial_index,
+    )
 
 
 def search_card(search: Search) -> StudyCard:
@@ -382,7 +406,7 @@ class Written(NamedTuple):
 
 def results(
     search: Search,
-    ledgers: Sequence[Ledger],
+    arm_studies: Sequence[ArmStudy],
     tracker: Tracker,
     home: Home,
     out: Path | None,
@@ -393,16 +417,16 @@ def results(
     A plot that cannot be drawn, or not be shown in the log, is left out, and that is said.
     """
     written = Written([], [])
-    for ledger in ledgers:
-        title = f"{search.name} ({search.profile}): {ledger.arm}"
-        with decoration(f"{ledger.arm}: plots", say):
+    for arm_study in arm_studies:
+        title = f"{search.name} ({search.profile}): {arm_study.arm}"
+        with decoration(f"{arm_study.arm}: plots", say):
             from pipelines.tuning.search_plots import plots
 
-            written.plots.extend(plots(ledger.study, title, plots_folder(search, home) / stem(ledger.arm)))
-        best = ledger.best()
+            written.plots.extend(plots(arm_study.study, title, plots_folder(search, home) / stem(arm_study.arm)))
+        best = arm_study.best()
         if out is not None and best is not None:
-            file = out / file_name(search, ledger.arm)
-            write_text(file, winner_yaml(search, ledger.arm, best, ledger.counts()))
+            file = out / file_name(search, arm_study.arm)
+            write_text(file, winner_yaml(search, arm_study.arm, best, arm_study.counts()))
             written.winners.append(file)
     files = (*written.plots, *written.winners)
     with decoration(f"{search.name}: overview in the log", say):
@@ -411,12 +435,12 @@ def results(
 
 
 def _summary(
-    search: Search, ledgers: Sequence[Ledger], tracker: "MlflowTracker", written: Written, whole: bool
+    search: Search, arm_studies: Sequence[ArmStudy], tracker: "MlflowTracker", written: Written, whole: bool
 ) -> None:
     console = terminal()
     console.print()
-    print_table(console, HEADER, [_row(ledger) for ledger in ledgers])
-    lines = [_best_line(ledger) for ledger in ledgers]
+    print_table(console, HEADER, [_row(arm_study) for arm_study in arm_studies])
+    lines = [_best_line(arm_study) for arm_study in arm_studies]
     lines += [f"winner: {file}" for file in written.winners]
     lines += [f"plot:   {file}" for file in written.plots]
     lines += [f"look:   {tracker.where()}", f"        experiment {tracker.name!r} in {without_password(tracker.uri)}"]
@@ -429,18 +453,19 @@ def _summary(
 HEADER = ["arm", "trials", "complete", "pruned", "running", "waiting", "failed", "missing", "best"]
 
 
-def _row(ledger: Ledger) -> list[str]:
-    counts, best = ledger.counts(), ledger.best()
+def _row(arm_study: ArmStudy) -> list[str]:
+    counts, best = arm_study.counts(), arm_study.best()
     numbers = [str(counts[name]) for name in HEADER[2:-1]]
-    return [ledger.arm, str(ledger.search.trials), *numbers, f"{best.value:.2f}" if best else "-"]
+    return [arm_study.arm, str(arm_study.search.trials), *numbers, f"{best.value:.2f}" if best else "-"]
 
 
-def _best_line(ledger: Ledger) -> str:
-    best = ledger.best()
+def _best_line(arm_study: ArmStudy) -> str:
+    best = arm_study.best()
     if best is None:
-        return f"{ledger.arm}: no trial is finished"
+        return f"{arm_study.arm}: no trial is finished"
     values = ", ".join(f"{name}={_short(value)}" for name, value in best.params.items())
-    return f"{ledger.arm}: {OBJECTIVE} {best.value:.2f} over {len(best.returns)} seeds in trial {best.place}: {values}"
+    value = f"{OBJECTIVE} {best.value:.2f} over {len(best.returns)} seeds"
+    return f"{arm_study.arm}: {value} in trial {best.trial_index}: {values}"
 
 
 def _short(value: object) -> str:
@@ -451,7 +476,7 @@ def show_search(search: Search, home: Path) -> int:
     """Print how far a search is: trials by state, the best so far, and those of other settings or code (stale).
 
     Returns:
-        0 every trial is closed, 1 not, 2 something is in the way.
+        0 every trial is closed, 1 not, 2 environment error.
     """
     place = Home(home)
     try:
@@ -460,9 +485,9 @@ def show_search(search: Search, home: Path) -> int:
                 print(f"{search.name} ({search.profile}): nothing has been tried yet")
                 return FAILED
             found = [look(search, arm, storage) for arm in search.arms]
-            print_table(terminal(), [*HEADER, "stale"], [[*_row(ledger), str(stale)] for ledger, stale in found])
-            print("\n".join(_best_line(ledger) for ledger, _ in found))
-            return DONE if all(ledger.closed >= search.trials for ledger, _ in found) else FAILED
+            print_table(terminal(), [*HEADER, "stale"], [[*_row(arm_study), str(stale)] for arm_study, stale in found])
+            print("\n".join(_best_line(arm_study) for arm_study, _ in found))
+            return DONE if all(arm_study.closed >= search.trials for arm_study, _ in found) else FAILED
     except StoreError as error:
         print(f"rhmc: {error}", file=sys.stderr)
         return BAD

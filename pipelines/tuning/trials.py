@@ -1,12 +1,12 @@
 """The trials of a search in Optuna's database: asked for, told, taken up again. The only module that stores in Optuna.
 
 Each arm has a study of its own there, named by search, profile, arm and the identity of its settings and code. A trial
-has a place in the budget. One that was interrupted is closed as failed and its values are enqueued again for the same
-place, so that it keeps its checkpoints and counts once.
+has an index in the budget of its arm. One that was interrupted is closed as failed, and its values are enqueued again
+under the same index, so that it keeps its checkpoints and counts once.
 
-Every proposal has a sampler of its own, seeded by the search's seed and the place. With one trial
-at a time a search therefore gives the same proposals whether or not it was interrupted; with several, what a proposal
-knows of the others depends on which of them were faster.
+Every proposal has a sampler of its own, seeded by the search's seed and the trial's index. With one trial at a time a
+search therefore gives the same proposals whether or not it was interrupted; with several, what a proposal knows of the
+others depends on which of them were faster.
 """
 
 import hashlib
@@ -39,33 +39,33 @@ ATTEMPTS = 3  # launches that try a trial which raises
 CLOSED = (TrialState.COMPLETE, TrialState.PRUNED)
 OBJECTIVE = "final/return"  # what the report calls a run's final return; its mean over the seeds is maximised
 CURVE = "eval/return"  # what a trial is pruned by
-PLACE, ERROR = "place", "error"  # attributes of a trial
+TRIAL_INDEX, ERROR = "trial_index", "error"  # attributes of a trial
 
 
-class Asked(NamedTuple):
+class TrialRequest(NamedTuple):
     """A trial to be trained."""
 
     arm: str
-    place: int  # in the budget of its arm, from 0
+    trial_index: int  # in the budget of its arm, from 0
     params: dict[str, Value]
     setting: Setting
 
     @property
     def name(self) -> str:
-        """What a person calls it."""
-        return f"{self.arm} t{self.place}"
+        """The name for people."""
+        return f"{self.arm} t{self.trial_index}"
 
 
 class Best(NamedTuple):
     """The best finished trial of an arm."""
 
-    place: int  # in the budget of its arm, from 0
+    trial_index: int  # in the budget of its arm, from 0
     params: dict[str, Value]
     value: float
     returns: list[float]  # of each seed
 
 
-class Ledger:
+class ArmStudy:
     """The trials of one arm.
 
     Args:
@@ -88,12 +88,12 @@ class Ledger:
         self.live: dict[int, optuna.Trial] = {}
 
     def latest(self) -> dict[int, FrozenTrial]:
-        """By place in the budget the trial that stands for it: the newest one with all its values, or under way."""
+        """By index, the trial that counts: the newest one with all its values, or under way."""
         standing = {}
         for trial in self.study.get_trials(deepcopy=False):
-            place = place_of(trial)
-            if place is not None and (trial.state != TrialState.FAIL or self._whole(trial)):
-                standing[place] = trial
+            trial_index = trial_index_of(trial)
+            if trial_index is not None and (trial.state != TrialState.FAIL or self._whole(trial)):
+                standing[trial_index] = trial
         return standing
 
     def _whole(self, trial: FrozenTrial) -> bool:
@@ -118,49 +118,51 @@ class Ledger:
         """
         latest, again = self.latest(), 0
         for trial in self.study.get_trials():
-            place = place_of(trial)
+            trial_index = trial_index_of(trial)
             if trial.state not in (TrialState.RUNNING, TrialState.FAIL):
                 continue
-            if place in latest and latest[place].number == trial.number and self._may_go_on(trial):
+            if trial_index in latest and latest[trial_index].number == trial.number and self._may_go_on(trial):
                 # Before it is closed: whoever dies in between has it twice, and the newest stands for both.
-                self.study.enqueue_trial(values_of(trial), user_attrs={PLACE: place})
+                self.study.enqueue_trial(values_of(trial), user_attrs={TRIAL_INDEX: trial_index})
                 again += 1
             if trial.state == TrialState.RUNNING:
                 self.study.tell(trial.number, state=TrialState.FAIL)
         return again
 
     def _may_go_on(self, trial: FrozenTrial) -> bool:
-        same = [t for t in self.study.get_trials(deepcopy=False) if place_of(t) == place_of(trial)]
+        same = [t for t in self.study.get_trials(deepcopy=False) if trial_index_of(t) == trial_index_of(trial)]
         return self._whole(trial) and sum(ERROR in t.user_attrs for t in same) < ATTEMPTS
 
-    def ask(self) -> Asked | None:
+    def ask(self) -> TrialRequest | None:
         """The next trial: one that was enqueued, or a new proposal. None, and pruned, where the method refuses it."""
         taken = self.latest()
-        place = next(number for number in count() if number not in taken)
-        self.study.sampler = make_sampler(self.search.sampler, place)
+        trial_index = next(number for number in count() if number not in taken)
+        self.study.sampler = make_sampler(self.search.sampler, trial_index)
         trial = self.study.ask()
-        if PLACE in trial.user_attrs:
-            place = int(trial.user_attrs[PLACE])
+        if TRIAL_INDEX in trial.user_attrs:
+            trial_index = int(trial.user_attrs[TRIAL_INDEX])
         else:
-            trial.set_user_attr(PLACE, place)
-        self.live[place] = trial
+            trial.set_user_attr(TRIAL_INDEX, trial_index)
+        self.live[trial_index] = trial
         params = {name: suggest(trial, name, one) for name, one in self.search.arms[self.arm].space.items()}
         try:
-            return Asked(self.arm, place, params, self.search.arms[self.arm].at(params))
+            return TrialRequest(self.arm, trial_index, params, self.search.arms[self.arm].at(params))
         except ValueError as error:
-            self._close(place, "pruned", f"refused: {one_line(error)}", TrialState.PRUNED)
+            self._close(trial_index, "pruned", f"refused: {one_line(error)}", TrialState.PRUNED)
             return None
 
-    def over(self) -> list[Asked]:
+    def over(self) -> list[TrialRequest]:
         """The trials that nothing more is done for, to be asked after `take_up`."""
         found = []
-        for place, trial in self.latest().items():
+        for trial_index, trial in self.latest().items():
             if trial.state not in (TrialState.RUNNING, TrialState.WAITING):
                 with suppress(ValueError):  # refused by the method: never trained
-                    found.append(Asked(self.arm, place, trial.params, self.search.arms[self.arm].at(trial.params)))
+                    found.append(
+                        TrialRequest(self.arm, trial_index, trial.params, self.search.arms[self.arm].at(trial.params))
+                    )
         return found
 
-    def report(self, trial: Asked, point: Metrics, number: int) -> str:
+    def report(self, trial: TrialRequest, point: Metrics, number: int) -> str:
         """Take in a point of a trial's curve.
 
         Args:
@@ -171,28 +173,28 @@ class Ledger:
         Returns:
             Why the trial should be given up; nothing if it should not.
         """
-        live, step = self.live[trial.place], int(point["step"])
+        live, step = self.live[trial.trial_index], int(point["step"])
         if not math.isfinite(point[CURVE] + point.get(OBJECTIVE, 0.0)):
             return f"no finite return at step {step}"
         live.report(point[CURVE], number)
         early = number < self.search.pruner.warmup or OBJECTIVE in point
         return "" if early or not live.should_prune() else f"behind the others at step {step}"
 
-    def complete(self, trial: Asked, returns: Sequence[float]) -> float:
+    def complete(self, trial: TrialRequest, returns: Sequence[float]) -> float:
         """Close a trial with the final return of each seed; their mean is its value."""
         value = math.fsum(returns) / len(returns)
-        live = self.live.pop(trial.place)
+        live = self.live.pop(trial.trial_index)
         live.set_user_attr("returns", list(returns))
         self.study.tell(live, value)
         return value
 
-    def prune(self, trial: Asked, why: str) -> None:
+    def prune(self, trial: TrialRequest, why: str) -> None:
         """Close a trial that is given up. It stays in the budget, and the sampler learns from it."""
-        self._close(trial.place, "pruned", why, TrialState.PRUNED)
+        self._close(trial.trial_index, "pruned", why, TrialState.PRUNED)
 
-    def fail(self, trial: Asked, error: str) -> None:
+    def fail(self, trial: TrialRequest, error: str) -> None:
         """Close a trial that raised."""
-        self._close(trial.place, ERROR, error, TrialState.FAIL)
+        self._close(trial.trial_index, ERROR, error, TrialState.FAIL)
 
     def _close(self, number: int, key: str, text: str, state: TrialState) -> None:
         live = self.live.pop(number)
@@ -201,15 +203,15 @@ class Ledger:
 
     def best(self) -> Best | None:
         """The finished trial with the highest value, the earliest among equals."""
-        closed = ((place, t) for place, t in sorted(self.latest().items()) if t.state == TrialState.COMPLETE)
-        done = [(t.value, place, t) for place, t in closed if t.value is not None]  # a pruned one has a value as well
+        closed = ((index, t) for index, t in sorted(self.latest().items()) if t.state == TrialState.COMPLETE)
+        done = [(t.value, index, t) for index, t in closed if t.value is not None]  # a pruned one has a value as well
         if not done:
             return None
-        value, place, trial = max(done, key=lambda one: one[0])
-        return Best(place, trial.params, value, trial.user_attrs["returns"])
+        value, trial_index, trial = max(done, key=lambda one: one[0])
+        return Best(trial_index, trial.params, value, trial.user_attrs["returns"])
 
     def counts(self) -> dict[str, int]:
-        """How many trials of the budget are in which state."""
+        """The number of trials of the budget in each state."""
         states = [trial.state for trial in self.latest().values()]
         names = {"complete": TrialState.COMPLETE, "pruned": TrialState.PRUNED, "running": TrialState.RUNNING}
         names |= {"waiting": TrialState.WAITING, "failed": TrialState.FAIL}
@@ -217,13 +219,13 @@ class Ledger:
         return counted | {"missing": max(0, self.search.trials - len(states))}
 
 
-def place_of(trial: FrozenTrial) -> int | None:
-    """The place in the budget, from 0; None for a trial that died before it had one."""
-    return trial.user_attrs.get(PLACE)
+def trial_index_of(trial: FrozenTrial) -> int | None:
+    """The index in the budget, from 0; None for a trial that died before it had one."""
+    return trial.user_attrs.get(TRIAL_INDEX)
 
 
 def values_of(trial: FrozenTrial) -> dict[str, Any]:
-    """What a trial tries, also while it waits."""
+    """The values that a trial tries, also while it waits."""
     return trial.params | trial.system_attrs.get("fixed_params", {})
 
 
@@ -232,12 +234,12 @@ def study_name(search: Search, arm: str) -> str:
     return f"{search.name} ({search.profile}) / {arm} / {search.identity(arm)}"
 
 
-def look(search: Search, arm: str, storage: BaseStorage) -> tuple[Ledger, int]:
-    """An arm's ledger for reading, empty where there is none, and how many trials have other settings or other code."""
+def look(search: Search, arm: str, storage: BaseStorage) -> tuple[ArmStudy, int]:
+    """An arm's study for reading, empty where there is none, and how many trials have other settings or other code."""
     name, names = study_name(search, arm), optuna.get_all_study_names(storage)
     others = [n for n in names if n != name and n.rpartition(" / ")[0] == name.rpartition(" / ")[0]]
     stale = sum(len(optuna.load_study(study_name=n, storage=storage).get_trials(deepcopy=False)) for n in others)
-    return Ledger(search, arm, storage if name in names else InMemoryStorage()), stale
+    return ArmStudy(search, arm, storage if name in names else InMemoryStorage()), stale
 
 
 # From the file's words to Optuna's
@@ -255,9 +257,9 @@ def suggest(trial: optuna.Trial, name: str, one: Dimension) -> Value:
     return trial.suggest_float(name, one.low, one.high, log=one.log, step=one.step)
 
 
-def make_sampler(cfg: Sampler, place: int) -> BaseSampler:
-    """The sampler for the trial at a place of the budget."""
-    seed = int.from_bytes(hashlib.sha256(f"{cfg.seed} {place}".encode()).digest()[:4])
+def make_sampler(cfg: Sampler, trial_index: int) -> BaseSampler:
+    """The sampler for the trial of this index."""
+    seed = int.from_bytes(hashlib.sha256(f"{cfg.seed} {trial_index}".encode()).digest()[:4])
     if cfg.kind == "random":
         return RandomSampler(seed=seed)
     return TPESampler(seed=seed, n_startup_trials=cfg.startup, multivariate=True, constant_liar=True)
@@ -276,7 +278,7 @@ class Asha(SuccessiveHalvingPruner):
     """Optuna's, but that a trial does not compete with what was left of it when it was interrupted."""
 
     def prune(self, study: optuna.Study, trial: FrozenTrial) -> bool:
-        """Whether to give the trial up."""
+        """True if to give the trial up."""
         return super().prune(cast(optuna.Study, _Standing(study)), trial)
 
 

@@ -33,14 +33,14 @@ def without_password(address: str) -> str:
 
 
 def unclear(address: str) -> bool:
-    """Whether a user name or password holds characters that end it, so that programs would read it differently."""
+    """True if a user name or password holds characters that end it, so that programs would read it differently."""
     kind, _, rest = address.partition("://")
     place = re.split(r"[/?#]", rest, maxsplit=1)[0]
     return not kind.startswith("sqlite") and ("@" in rest[len(place) :] or "#" in rest or place.count("@") > 1)
 
 
 def fault(variable: str, address: str) -> str:
-    """Why an address cannot be used, for a person; nothing if it is clear what in it is what."""
+    """The reason why an address cannot be used, for a person; nothing if it is clear what in it is what."""
     shown = f"{variable}={without_password(address)}: not an address that can be read"
     if unclear(address):
         return f"{shown}; in its name and password write @ as %40, / as %2F, ? as %3F and # as %23"
@@ -83,7 +83,7 @@ def _secrets() -> Iterator[str]:
 
 
 def _passwords(address: str) -> Iterator[str]:
-    """What may be secret in an address, as it is written there."""
+    """The parts that may be secret in an address, as it is written there."""
     kind, _, rest = address.partition("://")
     if not kind.startswith("sqlite"):
         password = rest.rpartition("@")[0].partition(":")[2]

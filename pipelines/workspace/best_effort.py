@@ -1,4 +1,4 @@
-"""What is only looked at: a description, a picture, a line on the board. It may be lacking, and never ends a launch."""
+"""Output that is only looked at: a description, a picture, a line on the board. A failure never ends a launch."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress

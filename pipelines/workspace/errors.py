@@ -1,4 +1,4 @@
-"""What a user can mend, and how text that others chose is shown. Imports nothing heavy: every verb needs it."""
+"""Errors that a user can mend, and the display of foreign text. Imports nothing heavy: every verb needs it."""
 
 import errno
 import os
@@ -11,7 +11,7 @@ LONGEST = 2_000  # characters of a line
 
 
 class InputError(Exception):
-    """What was given cannot be used. Each argument is a line of the message, meant for a person. Exit code 2.
+    """The input cannot be used. Each argument is a line of the message, meant for a person. Exit code 2.
 
     A line may hold names, paths and values as they were typed: `str` shows them by `visible`, so that nobody's file
     name moves the cursor, hides what follows, or adds a line of its own. Where the system has no room for another open
@@ -41,7 +41,7 @@ def visible_lines(text: str) -> str:
 
 
 def seen(character: str) -> bool:
-    """Whether a character shows as itself."""
+    """True if a character shows as itself."""
     return character.isprintable() or unicodedata.category(character) == "Zs"
 
 

@@ -34,7 +34,7 @@ def regular(path: Path, what: str = "", *, absent: bool = False) -> Path:
 
 
 def fault_of(path: Path) -> str:
-    """Why a path cannot be read as a file, in words; nothing if it can. Nothing is opened: that may wait for ever."""
+    """The reason why a path is no readable file; nothing if it is one. Opens nothing: that may wait for ever."""
     try:
         mode = path.stat().st_mode
     except FileNotFoundError:

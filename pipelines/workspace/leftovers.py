@@ -1,4 +1,4 @@
-"""What is not finished yet carries its writer in its name, so that what a killed process left can be told and swept.
+"""Files that are not finished carry their writer in their names, so that those of a killed process are swept.
 
 A part lies beside what it will be (`runs.parquet.<host>-<pid>.part`), a scratch folder in the system's temporary folder
 (`rhmc-<host>-<pid>-...`). Whoever writes the same thing again takes the parts of the dead away, and whoever needs
@@ -32,7 +32,7 @@ def owner() -> str:
 
 
 def dead(writer: str) -> bool:
-    """Whether a process of this machine is gone; this one's own number means a former one, as in a new container."""
+    """True if a process of this machine is gone; this one's own number means a former one, as in a new container."""
     host, _, number = writer.rpartition("-")
     if host != HOST or not number.isascii() or not number.isdigit():
         return False
@@ -46,7 +46,7 @@ def dead(writer: str) -> bool:
 
 
 def part_of(path: Path) -> Path:
-    """Where this process writes what is to become `path`; what dead ones left of it is removed.
+    """The place where this process writes what is to become `path`; parts that dead processes left are removed.
 
     Raises:
         FileExistsError: a device, a pipe or a socket is there, which a rename would put an end to for all who use it.

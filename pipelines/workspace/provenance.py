@@ -1,4 +1,4 @@
-"""Where and with what runs are made, in words for people: a report's provenance."""
+"""The machine and the libraries that make runs, in words for people: a report's provenance."""
 
 import os
 import platform

@@ -38,7 +38,7 @@ MOVABLE = ("sqlite", "postgresql", "mysql")  # databases whose addresses are bro
 
 
 def is_own(uri: str, home: Home) -> bool:
-    """Whether a store is the work folder's own database, which moves with it."""
+    """True if a store is the work folder's own database, which moves with it."""
     return uri.startswith("sqlite:") and sqlite.sqlite_file(uri).resolve() == home.database
 
 
@@ -49,7 +49,7 @@ def folder(uri: str) -> Path | None:
 
 
 def run_folder(stored: str, home: Home, *, own: bool) -> Path | None:
-    """Where the files of a run are now.
+    """The present place of the files of a run.
 
     Args:
         stored: the address that MLflow keeps, `<artifacts>/<run>/artifacts`.
@@ -67,7 +67,7 @@ def run_folder(stored: str, home: Home, *, own: bool) -> Path | None:
 
 
 def _moved(stored: Path, home: Home, runs: Sequence[str], *, own: bool) -> bool:
-    """Whether the artifacts of a work folder that was elsewhere are those of this one.
+    """True if the artifacts of a work folder that was elsewhere are those of this one.
 
     Another folder that keeps files of a database of ours by a person's wish, or another work folder that shares a
     database, stays where it is.

@@ -22,7 +22,7 @@ def settle() -> None:
 
 
 def _speaks_utf8() -> bool:
-    """Whether names of files and the content of texts are UTF-8 unless somebody says otherwise."""
+    """True if names of files and the content of texts are UTF-8 unless somebody says otherwise."""
     return sys.getfilesystemencoding().lower() in UTF8 and locale.getencoding().lower() in UTF8
 
 
@@ -42,7 +42,7 @@ def patient(stream: IO[str] | None, number: int) -> IO[str]:
 
 
 def _is(stream: IO[str], number: int) -> bool:
-    """Whether a stream is that of a descriptor, and not what somebody has put in its place."""
+    """True if a stream is that of a descriptor, and not what somebody has put in its place."""
     try:
         return stream.fileno() == number
     except (OSError, ValueError):
@@ -73,7 +73,7 @@ class Abandoned(io.FileIO):
 
 
 def lost() -> str:
-    """Why what was printed on stdout is not all there; nothing if it is, or if nobody wanted more of it."""
+    """The reason why the output on stdout is not complete; nothing if it is, or if nobody wanted more of it."""
     sys.stderr.flush()
     sys.stdout.flush()
     raw = getattr(getattr(sys.stdout, "buffer", None), "raw", None)

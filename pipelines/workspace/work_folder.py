@@ -27,7 +27,7 @@ OUT_OF_IT = errno.EINVAL  # what seeking to before the start of a file gives
 
 
 class StoreError(InputError):
-    """Something outside the program is in the way; str() is the whole message, one line, without passwords."""
+    """Environment error, from outside the program; str() is the whole message, one line, without passwords."""
 
     def __init__(self, text: str) -> None:
         super().__init__(scrubbed(text))
@@ -67,11 +67,11 @@ class Home:
         self.searches = self.root / "optuna.db"
 
     def checkpoints(self, key: str) -> Path:
-        """Where the checkpoints of a run (spec id and fingerprint) lie."""
+        """The folder where the checkpoints of a run (spec id and fingerprint) lie."""
         return self.root / "checkpoints" / key
 
     def scratch(self, study: str, profile: str) -> Path:
-        """What Ray writes while a study runs; worth nothing afterwards."""
+        """The folder that Ray writes to while a study runs; worth nothing afterwards."""
         return self.root / "ray" / f"{study}-{profile}"
 
     def name(self, study: str, profile: str) -> str:
@@ -119,7 +119,7 @@ class Home:
             lock.release()
 
     def driven(self, study: str, profile: str) -> bool:
-        """Whether a process drives the study and profile in this folder."""
+        """True if a process drives the study and profile in this folder."""
         with suppress(FileNotFoundError), self._lock_file(study, profile).open("rb") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # let go as the file is closed
@@ -234,7 +234,7 @@ def save_atomically(path: Path, state: Any) -> None:
 
 
 def load_whole(path: Path) -> Any:
-    """What `save_atomically` wrote.
+    """The content that `save_atomically` wrote.
 
     `torch.load` alone does not see bytes that changed inside a tensor, such as a block that a power cut left as zeros;
     the checksums that `torch.save` writes beside each tensor do.
@@ -288,7 +288,7 @@ def _not_loaded(path: Path, error: Exception) -> StoreError:
 
 
 def lacks_memory(error: BaseException) -> bool:
-    """Whether there was not enough memory, which torch says by a `RuntimeError`."""
+    """True if there was not enough memory, which torch says by a `RuntimeError`."""
     words = ("can't allocate memory", "not enough memory", "out of memory", "allocation failed")
     return isinstance(error, MemoryError) or any(word in str(error).lower() for word in words)
 
@@ -339,7 +339,7 @@ def one_line(error: BaseException) -> str:
 
 
 def reason(error: BaseException) -> str:
-    """What the system said, where a library wrapped it in words of its own."""
+    """The system's message, where a library wrapped it in words of its own."""
     for inner in _chain(error):
         if isinstance(inner, OSError) and inner.strerror:
             return inner.strerror

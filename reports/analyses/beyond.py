@@ -1,4 +1,4 @@
-"""What the paper does not show: assignments while training, transfer to other numbers, and what the encoder does."""
+"""Analyses beyond the paper: assignments while training, transfer to other numbers, and the effect of the encoder."""
 
 from collections.abc import Mapping, Sequence
 from itertools import combinations
@@ -22,7 +22,7 @@ PANELS = (
     ("free", "targets with no agent"),
 )
 LETTERS = 60  # of a name on a line of a legend
-RULERS = ("best_window", "planner", "free_heading_bound")  # beside transferred policies
+BESIDE_TRANSFER = ("best_window", "planner", "free_heading_bound")  # beside transferred policies
 
 
 class Axis(NamedTuple):
@@ -77,7 +77,7 @@ def fig_assignments(results: Results, study: str) -> Drawing | None:
 
 
 def table_assignments(results: Results, study: str) -> Table | None:
-    """What arms assign in the first and in the last tenth of their training, and where Algorithm 1 falls short."""
+    """Assignments of arms in the first and last tenth of their training, and the shortfall of Algorithm 1."""
     numbers, shown = [], []
     for arm in assigning(results, study):
         first, last, whole = (_tenths(results, study, arm, part) for part in ("first", "last", "whole"))
@@ -158,7 +158,7 @@ def transferred(results: Results) -> dict[str, dict[str, dict[int, Interval]]]:
 
 
 def fig_transfer(results: Results) -> Drawing | None:
-    """Return of policies with other numbers than they were trained with, scripted ones beside; None if none played."""
+    """Return of policies with other numbers than they were trained with, yardsticks beside; None if none played."""
     found = transferred(results)
     if not found:
         return None
@@ -169,14 +169,14 @@ def fig_transfer(results: Results) -> Drawing | None:
         head(figure, "Trained once, played with other numbers", f"{results.moved['task'].iloc[0]}; {trained}")
         for n, axis in enumerate(axis for axis in AXES if axis.name in found):
             axes = figure.add_axes((0.055 + 0.49 * n, 0.17, 0.29, 0.67))
-            rulers = _rulers(results, axis, sorted({count for by in found[axis.name].values() for count in by}))
-            _panel(axes, found[axis.name], rulers, axis, _trained(results, axis.name))
+            yardsticks = _yardsticks(results, axis, sorted({count for by in found[axis.name].values() for count in by}))
+            _panel(axes, found[axis.name], yardsticks, axis, _trained(results, axis.name))
             rows += [
                 (axis.name, "method", arm, count, *x) for arm, by in found[axis.name].items() for count, x in by.items()
             ]
             rows += [
                 (axis.name, "yardstick", name, count, value, np.nan, np.nan, 0)
-                for name, by in rulers.items()
+                for name, by in yardsticks.items()
                 for count, value in by.items()
             ]
         least = min(x.n for arms in found.values() for by in arms.values() for x in by.values())
@@ -205,10 +205,10 @@ def table_transfer(results: Results) -> Table | None:
             if found:
                 numbers.append({"arm": arm, "agents": n, "targets": m} | found._asdict())
         shown.append(cells)
-    for name in RULERS:
+    for name in BESIDE_TRANSFER:
         cells = {"Arm": readable(name)}
         for n, m in sizes:
-            value = _scripted(results, name, n, m)
+            value = _yardstick(results, name, n, m)
             cells[f"{n} x {m}"] = number(value)
             numbers.append({"arm": name, "agents": n, "targets": m, "value": value, "n": 0})
         shown.append(cells)
@@ -229,18 +229,18 @@ def _trained(results: Results, name: str) -> int:
     return int(results.moved[f"trained_{name}"].iloc[0])
 
 
-def _scripted(results: Results, name: str, agents: int, targets: int) -> float:
+def _yardstick(results: Results, name: str, agents: int, targets: int) -> float:
     env = results.env(str(results.moved["study"].iloc[0])) | {"agents": agents, "targets": targets}
     scores = results.yardsticks_on(env)
     return float(scores[FINAL][name]) if FINAL in scores and name in scores.index else float("nan")
 
 
-def _rulers(results: Results, axis: Axis, counts: Sequence[int]) -> dict[str, dict[int, float]]:
+def _yardsticks(results: Results, axis: Axis, counts: Sequence[int]) -> dict[str, dict[int, float]]:
     found: dict[str, dict[int, float]] = {}
-    for name in RULERS:
+    for name in BESIDE_TRANSFER:
         for count in counts:
             numbers = {axis.name: count, axis.fixed: _trained(results, axis.fixed)}
-            if np.isfinite(value := _scripted(results, name, numbers["agents"], numbers["targets"])):
+            if np.isfinite(value := _yardstick(results, name, numbers["agents"], numbers["targets"])):
                 found.setdefault(name, {})[count] = value
     return found
 
@@ -248,13 +248,13 @@ def _rulers(results: Results, axis: Axis, counts: Sequence[int]) -> dict[str, di
 def _panel(
     axes: Axes,
     arms: Mapping[str, Mapping[int, Interval]],
-    rulers: Mapping[str, Mapping[int, float]],
+    yardsticks: Mapping[str, Mapping[int, float]],
     axis: Axis,
     trained: int,
 ) -> None:
     axes.axvline(trained, color=FAINT, linewidth=6, alpha=0.35, zorder=0)
     labels = []
-    for name, line in rulers.items():
+    for name, line in yardsticks.items():
         dashes = (0, (6, 2)) if name.endswith("_bound") else "-"
         axes.plot(list(line), list(line.values()), color=FAINT, linestyle=dashes, linewidth=1.2, marker=".", zorder=1)
         labels.append((list(line.values())[-1], f"{readable(name)} {number(list(line.values())[-1])}", QUIET))
@@ -275,11 +275,11 @@ def _panel(
         axes.text(1.03, place, text, color=colour, transform=axes.transAxes, fontsize=8.5, va="center")
 
 
-# Scripted policies by number, and the encoder
+# Yardsticks by number, and the encoder
 
 
 def table_numbers(results: Results) -> Table | None:
-    """Scripted policies and bounds of coverage by number of sensors; None with fewer than two numbers."""
+    """Yardsticks of coverage by number of sensors; None with fewer than two numbers."""
     found = {
         (int(task["agents"]), int(task["targets"])): scores
         for task, scores in results.yardsticks
@@ -301,7 +301,7 @@ def table_numbers(results: Results) -> Table | None:
         {"Policy": readable(name)} | {f"{n} x {m}": number(value[name, (n, m)]) for n, m in sorted(found)}
         for name in order
     ]
-    title = "Scripted policies and bounds by numbers of sensors x targets, coverage flat"
+    title = "Yardsticks by numbers of sensors x targets, coverage flat"
     return Table(title, pd.DataFrame(numbers), pd.DataFrame(shown))
 
 

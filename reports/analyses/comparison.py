@@ -1,6 +1,6 @@
 """Arms of one study against each other: pairs, performance profiles, probability of improvement, sample efficiency.
 
-All of it is over seeds. Every run of a study plays the same bank of episodes at its end, so the bank's luck is the same
+All of it is over seeds. Every run of a study plays the same evaluation episodes at its end, so their luck is the same
 for all arms and cancels in a difference; single episodes are not exported, so there is nothing to pair below a seed.
 """
 
@@ -21,8 +21,8 @@ from reports.render.tables import MEASURED, NONE, Table, estimate, number, steps
 
 LETTERS, LONGEST = 44, 60  # of a name on a line of a legend, and beside a matrix
 MOST = 12  # arms of a matrix that can still be read
-LEVEL_SHARE = 0.9  # of the best arm's mean final return, where no scripted policy gives a level
-RULER = {"coverage": "best_window", "navigation": "nearest"}  # each agent alone, without learning
+LEVEL_SHARE = 0.9  # of the best arm's mean final return, where no yardstick gives a level
+LEVEL_YARDSTICK = {"coverage": "best_window", "navigation": "nearest"}  # each agent alone, without learning
 
 
 class Pair(NamedTuple):
@@ -138,9 +138,9 @@ def time_to_level(results: Results, study: str) -> Table | None:
 def reference(results: Results, study: str) -> Level | None:
     """The level of `efficiency`: each agent alone without learning, else 90 % of the best arm; None without runs."""
     scores = results.yardsticks_of(study)
-    name = RULER.get(str(results.env(study).get("kind")), "")
+    name = LEVEL_YARDSTICK.get(str(results.env(study).get("kind")), "")
     if FINAL in scores and name in scores.index:
-        return Level(float(scores[FINAL][name]), f"what the scripted policy {name.replace('_', ' ')} gets")
+        return Level(float(scores[FINAL][name]), f"the score of the yardstick {name.replace('_', ' ')}")
     means = [float(values.mean()) for arm in results.arms(study) if len(values := results.finals(study, arm))]
     if not means or max(means) <= 0:
         return None
@@ -240,7 +240,7 @@ def _pairs_note(found: Sequence[Pair]) -> str:
     least = min(x.difference.n for x in found)
     note = (
         "p: Welch's test over seeds; Holm: corrected for all pairs of this table. Intervals are of one pair each, not "
-        "corrected. All arms play the same final bank of episodes; single episodes are not exported, so the pairing is "
+        "corrected. All arms play the same final episodes; single episodes are not exported, so the pairing is "
         "of arms, not of episodes."
     )
     if least < 4:

@@ -12,6 +12,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import pandas as pd
 
+from reports.data.exported import older
 from reports.data.frame import FINAL, TableError
 from reports.data.stats import Interval, Values, difference, equivalence, equivalence_of_pairs
 
@@ -24,7 +25,7 @@ HOLDS: tuple[Outcome, ...] = ("byte-equal", "equivalent")
 
 
 class Compared(NamedTuple):
-    """What came of an arm. `difference` (here less published) and `p` where bytes differ, else NaN."""
+    """The comparison of an arm. `difference` (here less published) and `p` where bytes differ, else NaN."""
 
     study: str
     arm: str
@@ -36,7 +37,7 @@ class Compared(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Whether the published result stands."""
+        """True if the published result stands."""
         return self.outcome in HOLDS
 
 
@@ -47,12 +48,15 @@ def read(folder: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Values and runs of all studies in a folder of exported tables.
 
     Raises:
-        TableError: there is none, or one is not readable.
+        TableError: there is none, or one is not readable, or of an older version.
     """
     names = sorted(file.name.removesuffix(".runs.parquet") for file in folder.glob("*.runs.parquet"))
     names = [name for name in names if (folder / f"{name}.parquet").is_file()]
     if not names:
         raise TableError(f"{folder}: no exported tables (*.runs.parquet) here")
+    if any(older(folder / f"{name}.runs.parquet") for name in names):
+        remedy = "`rhmc study run` and `rhmc export` make them anew, `rhmc verify --publish` publishes them"
+        raise TableError(f"{folder}: tables of an older version, which are not compared; {remedy}")
     try:
         values = [pd.read_parquet(folder / f"{name}.parquet") for name in names]
         runs = [pd.read_parquet(folder / f"{name}.runs.parquet") for name in names]

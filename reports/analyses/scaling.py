@@ -55,13 +55,13 @@ def figure(results: Results, found: Sweep) -> Drawing | None:
     values = {method: by_count for method, by_count in estimates(results, found).items() if by_count}
     if not values:
         return None
-    rulers = _rulers(results, found)
+    yardsticks = _yardsticks(results, found)
     with styled():
         picture = blank(9.0, 5.6)
         head(picture, "Final return by number of agents", _under(results, found))
         axes = picture.add_axes((0.075, 0.16, 0.66, 0.72))
         labels = [_draw(axes, method, values[method], list(values)) for method in reversed(list(values))]
-        labels += [_draw_ruler(axes, name, by_count) for name, by_count in rulers.items()]
+        labels += [_draw_yardstick(axes, name, by_count) for name, by_count in yardsticks.items()]
         axes.set_xticks(found.counts)
         axes.set_xlabel("agents")
         axes.set_ylabel("final return")
@@ -72,7 +72,7 @@ def figure(results: Results, found: Sweep) -> Drawing | None:
         foot(
             picture, f"points: mean over seeds; bars: 95 % bootstrap interval{words}\n{_missing_words(results, found)}"
         )
-    return Drawing(picture, _numbers(values, rulers))
+    return Drawing(picture, _numbers(values, yardsticks))
 
 
 def table(results: Results, found: Sweep) -> Table:
@@ -106,8 +106,8 @@ def _under(results: Results, found: Sweep) -> str:
     return f"{task}{targets}; {steps(budget) if budget else 'unknown'} steps; profile: {results.profile}"
 
 
-def _rulers(results: Results, found: Sweep) -> dict[str, dict[int, float]]:
-    """Scripted policies and bounds by number of agents, where they were run."""
+def _yardsticks(results: Results, found: Sweep) -> dict[str, dict[int, float]]:
+    """Yardsticks by number of agents, where they were run."""
     out: dict[str, dict[int, float]] = {}
     env = results.env(found.study)
     for count in found.counts:
@@ -128,7 +128,7 @@ def _draw(axes: Axes, method: str, values: Mapping[int, Interval], methods: list
     return means[-1], "\n".join(wrap(f"{method} {number(means[-1])}", LETTERS)), colour
 
 
-def _draw_ruler(axes: Axes, name: str, values: Mapping[int, float]) -> tuple[float, str, str]:
+def _draw_yardstick(axes: Axes, name: str, values: Mapping[int, float]) -> tuple[float, str, str]:
     dashes = (0, (6, 2)) if name.endswith("_bound") else "-"
     axes.plot(list(values), list(values.values()), color=FAINT, linestyle=dashes, linewidth=1, marker=".", zorder=1)
     last = list(values.values())[-1]
@@ -152,11 +152,15 @@ def _missing_words(results: Results, found: Sweep) -> str:
     return f"no finished run yet: {', '.join(absent[:6])}{' and more' if len(absent) > 6 else ''}" if absent else ""
 
 
-def _numbers(values: Mapping[str, Mapping[int, Interval]], rulers: Mapping[str, Mapping[int, float]]) -> pd.DataFrame:
+def _numbers(
+    values: Mapping[str, Mapping[int, Interval]], yardsticks: Mapping[str, Mapping[int, float]]
+) -> pd.DataFrame:
     rows = [
         ("method", method, count, x.value, x.low, x.high, x.n)
         for method, by_count in values.items()
         for count, x in by_count.items()
     ]
-    rows += [("yardstick", name, n, value, np.nan, np.nan, 0) for name, by in rulers.items() for n, value in by.items()]
+    rows += [
+        ("yardstick", name, n, value, np.nan, np.nan, 0) for name, by in yardsticks.items() for n, value in by.items()
+    ]
     return pd.DataFrame(rows, columns=["kind", "name", "agents", "value", "low", "high", "seeds"])

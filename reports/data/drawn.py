@@ -1,4 +1,4 @@
-"""What the package writes as JSON, checked as it is read: methods (Table 1), networks and scenes (Figures 1 to 5, 8).
+"""The JSON files of the package, checked as it is read: methods (Table 1), networks and scenes (Figures 1 to 5, 8).
 
 A part that is not there draws nothing; a part of another form is a fault of one line.
 """
@@ -24,7 +24,7 @@ class Part(BaseModel):
 
 
 class Kind(BaseModel):
-    """What every task says of itself; the rest of its configuration is kept as it is."""
+    """The fields that every task states; the rest of its configuration is kept as it is."""
 
     model_config = ConfigDict(frozen=True, extra="allow")
     kind: str
@@ -55,7 +55,7 @@ class Method(Part):
 
 
 class Input(Part):
-    """What a network is given; shape without the batch."""
+    """The input of a network; shape without the batch."""
 
     name: str
     shape: tuple[int, ...]
@@ -92,7 +92,7 @@ class Network(Part):
 
 
 class Settings(Part):
-    """What shapes the method beside its networks."""
+    """The steps of the method beside its networks."""
 
     filter: str
     regulator: str
@@ -148,7 +148,7 @@ class Joint(Part):
 
 
 class Paths(Part):
-    """What Algorithm 1 settles on, and a best joint option."""
+    """The choice of Algorithm 1, and a best joint option."""
 
     algorithm_1: Joint
     optimum: Joint

@@ -57,7 +57,7 @@ def _between(part: str) -> str:
 
 
 def words(marked: str) -> str:
-    """What a line of ours says: that of `markdown` and code between backticks, without the marks of either."""
+    """The text of a line of ours: that of `markdown` and code between backticks, without the marks of either."""
     return re.sub(rf"\\([{PUNCTUATION}])|`", r"\1", marked)
 
 
@@ -81,7 +81,7 @@ def cell(text: str) -> str:
 
 
 def typed(text: str) -> str:
-    """What was typed in a cell of CSV."""
+    """The text that was typed in a cell of CSV."""
     return text[1:] if text[:1] == "'" and FORMULA.match(text) else text
 
 

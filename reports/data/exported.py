@@ -34,6 +34,7 @@ FORMS: Mapping[str, tuple[str, ...]] = {
     MOVED: PLAYED,
 }
 
+VERSION = (b"rhmc.tables", b"2")  # in the metadata of a table of runs
 WHOLE = ("seed", "step", "agents", "targets", "trained_agents", "trained_targets")  # columns of integers from 0
 NUMBERS = ("value", "seconds")  # columns of numbers; an empty cell is NaN. All others hold words
 UNKNOWN = ("fingerprint", "question", "commit", *TOLD)  # words that may not be known
@@ -49,12 +50,24 @@ def part(path: Path) -> str:
 
 
 def earlier(path: Path) -> bool:
-    """Whether a table of runs has the form in which they still told how and where they were made."""
+    """True if a table of runs has the form in which they still told how and where they were made."""
     try:
-        names = pq.read_schema(pa.BufferReader(content(path))).names if part(path) == "runs" else []
+        names = _schema(path).names if part(path) == "runs" else []
     except (OSError, ValueError, pa.ArrowException):
         return False  # `read` says what is wrong with it
     return not set(OWN).isdisjoint(names)
+
+
+def older(path: Path) -> bool:
+    """True if a table of runs was exported by an older version, with that version's names of studies and settings."""
+    try:
+        return part(path) == "runs" and VERSION not in (_schema(path).metadata or {}).items()
+    except (OSError, ValueError, pa.ArrowException):
+        return False  # `read` says what is wrong with it
+
+
+def _schema(path: Path) -> pa.Schema:
+    return pq.read_schema(pa.BufferReader(content(path)))
 
 
 def read(path: Path, faults: list[str]) -> pd.DataFrame:
@@ -82,7 +95,7 @@ def _why(path: Path, error: Exception) -> str:
 
 
 def _columns(table: pa.Table, wanted: Sequence[str]) -> Iterator[str]:
-    """What is wrong with the columns of a table."""
+    """The fault of the columns of a table."""
     names = table.column_names
     absent = [name for name in wanted if name not in names]
     if absent:
@@ -95,7 +108,7 @@ def _columns(table: pa.Table, wanted: Sequence[str]) -> Iterator[str]:
 
 
 def _faults(column: pa.ChunkedArray, name: str) -> Iterator[str]:
-    """What is wrong with a column: its type, its empty cells, its range."""
+    """The fault of a column: its type, its empty cells, its range."""
     kind, what = _held(column.type), "words"
     fits = _worded(kind)
     if name in (*WHOLE, *NUMBERS):
@@ -120,7 +133,7 @@ def _worded(kind: pa.DataType) -> bool:
 
 
 def _held(kind: pa.DataType) -> pa.DataType:
-    """What a column holds, in a dictionary or as it is."""
+    """The type of a column's values, in a dictionary or as it is."""
     return kind.value_type if pa.types.is_dictionary(kind) else kind
 
 
@@ -162,14 +175,14 @@ class Env(Loose):
 
 
 class Trainer(Loose):
-    """How a run is trained."""
+    """The budget of a run."""
 
     steps: Count | None = None
     final_episodes: Count | None = None
 
 
 class Config(Loose):
-    """What a report looks at in the configuration of a run."""
+    """The part of a run's configuration that a report looks at."""
 
     env: Env = Env()
     algo: dict[str, Any] = {}
@@ -178,7 +191,7 @@ class Config(Loose):
 
 @cache
 def config_fault(text: str) -> str:
-    """What is wrong with the configuration of a run; nothing if it can be used."""
+    """The fault of the configuration of a run; nothing if it can be used."""
     try:
         return "" if Config.model_validate_json(text).model_fields_set else "is no JSON object"
     except ValidationError as error:

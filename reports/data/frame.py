@@ -32,6 +32,7 @@ from reports.data.exported import (
     TOLD,
     config_fault,
     earlier,
+    older,
     part,
     read,
 )
@@ -44,9 +45,10 @@ EPISODES = "episode_*.gif"  # animations, one a task
 YARDSTICKS, THEOREM = "yardsticks", "theorem"  # tables that are no studies
 ASSIGN = "assign/"  # prefix of its metrics
 FINAL, CURVE = "final/return", "eval/return"
-ERRORS = ("final/return_sem", "final/coverage_sem")  # of a scripted policy; one of both is there
+ERRORS = ("final/return_sem", "final/coverage_sem")  # of a yardstick; one of both is there
 CHECKED = ("final/", "eval/", "theorem/", ASSIGN)  # metrics that are shown: they must be finite
 REMEDY = "`rhmc export` and `rhmc yardsticks all` write them anew, and how runs were made to *.made.parquet"
+OLDER = "made by an older version and set aside, until `rhmc study run` and `rhmc export` make them anew"
 SHOWN = 5  # faults of one kind that are spelled out
 
 # The order of arms everywhere; others follow by name.
@@ -83,6 +85,7 @@ class Results:
         scenes: what Figures 4, 5 and 8 show.
         moved: trained policies with other numbers of agents and targets: columns `PLAYED`.
         notes: what was left out of the tables, in sentences.
+        older: studies whose tables an older version exported.
         episodes: an animation of an episode by task, as a GIF.
     """
 
@@ -94,7 +97,13 @@ class Results:
     scenes: Scenes | None = None
     moved: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=list(PLAYED)))
     notes: tuple[str, ...] = ()
+    older: tuple[str, ...] = ()
     episodes: Mapping[str, bytes] = field(default_factory=dict)
+
+    @property
+    def set_aside(self) -> str:
+        """A sentence on tables of an older version; empty without any."""
+        return f"Tables of {', '.join(self.older)}: {OLDER}." if self.older else ""
 
     @property
     def studies(self) -> list[str]:
@@ -188,7 +197,7 @@ class Results:
 
     @cached_property
     def yardsticks(self) -> list[tuple[dict[str, Any], pd.DataFrame]]:
-        """Per task: its configuration, and one row per scripted policy (index) with a column per metric."""
+        """Per task: its configuration, and one row per yardstick (index) with a column per metric."""
         found: dict[str, set[str]] = {}
         for row in self.runs[self.runs["study"] == YARDSTICKS].itertuples():
             key = json.dumps(_config(str(row.config)).get("env", {}), sort_keys=True)
@@ -201,7 +210,7 @@ class Results:
         return out
 
     def yardsticks_of(self, study: str) -> pd.DataFrame:
-        """Scripted policies on a study's task, however agents observe it; empty if none were run."""
+        """Yardsticks on a study's task, however agents observe it; empty if none were run."""
         return self.yardsticks_on(self.env(study))
 
     def yardsticks_on(self, env: Mapping[str, Any]) -> pd.DataFrame:
@@ -209,7 +218,7 @@ class Results:
         return next((table for task, table in self.yardsticks if env and same_task(env, task)), pd.DataFrame())
 
     def gaps(self, expected: Mapping[str, Sequence[str]]) -> list[str]:
-        """What is not there, in sentences of Markdown; `escape.words` gives them without its marks.
+        """The gaps, in sentences of Markdown; `escape.words` gives them without its marks.
 
         Args:
             expected: arms that the paper has, per study.
@@ -234,7 +243,7 @@ class Results:
         if absent:
             yield f"Study `{study}`: no such arm yet: {markdown(', '.join(absent))}."
         if self.yardsticks_of(study).empty:
-            yield f"Study `{study}`: no scripted policies were run on this task."
+            yield f"Study `{study}`: no yardsticks were run on this task."
 
     def _trainer(self, study: str, name: str) -> int | None:
         found = [_config(text).get("trainer", {}).get(name) for text in self.plan(study)["config"]]
@@ -298,7 +307,8 @@ def load(folder: Path, profile: str, only: str | None = None) -> Results:
         points = _join([joined["points"], watched], POINTS)
         gifs = {path.stem.partition("_")[2]: _animation(path) for path in sorted(folder.glob(EPISODES))}
         runs = _with_made(joined["runs"], joined[MADE])
-        results = Results(points, runs, profile, moved=moved, notes=notes)
+        aside = tuple(path.name.partition(".")[0] for path in files if older(path))
+        results = Results(points, runs, profile, moved=moved, notes=notes, older=aside)
         if only is None:
             methods, modules, scenes = drawn
             results = replace(results, methods=methods, modules=modules, scenes=scenes, episodes=gifs)
@@ -315,7 +325,7 @@ def without_count(arm: str, agents: int) -> str:
 
 
 def same_task(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
-    """Whether two configurations are one task: how it is observed does not count, nor what only one writes out."""
+    """True if two configurations are one task: how it is observed does not count, nor what only one writes out."""
     shared = (a.keys() & b.keys()) - {"observation"}
     return "kind" in shared and all(a[key] == b[key] for key in shared)
 
@@ -329,7 +339,7 @@ def _animation(path: Path) -> bytes:
 
 
 def _of_plan(tables: Mapping[str, pd.DataFrame]) -> tuple[pd.DataFrame, pd.DataFrame, tuple[str, ...]]:
-    """What was watched and played later, without rows of runs that are no longer planned; and which studies had such.
+    """The tables of assignments and transfer, without runs that are no longer planned; and which studies had such.
 
     These tables are made by commands of their own, so they can be older than the plan: not a fault, but not shown.
     """
@@ -452,12 +462,12 @@ def _config(text: str) -> dict[str, Any]:
 
 
 def adopted(runs: pd.DataFrame) -> bool:
-    """Whether older code made some of the runs, and trainings of the present code repeated it."""
+    """True if older code made some of the runs, and trainings of the present code repeated it."""
     return bool(runs["adopted"].astype(bool).any())
 
 
 def mixed(runs: pd.DataFrame) -> bool:
-    """Whether runs of one method in one task were made by different code."""
+    """True if runs of one method in one task were made by different code."""
     known = runs[runs["fingerprint"].fillna("") != ""]
     place = ["algorithm", "task"]
     return len(known[[*place, "fingerprint"]].drop_duplicates()) > len(known[place].drop_duplicates())

@@ -68,19 +68,19 @@ class Statement(Part):
 
 
 class Paper(Part):
-    """Everything the paper states that is compared. `rulers`: scripted policies in the figures of other studies."""
+    """Everything the paper states that is compared. `yardsticks`: those in the figures of other studies, by task."""
 
     table_2: Ablation
     figures: dict[str, Curves]
     arms: dict[str, tuple[str, ...]]
     steps: dict[str, Count]
     claims: dict[str, Statement]
-    rulers: dict[str, tuple[str, ...]]
+    yardsticks: dict[str, tuple[str, ...]]
 
     def curves_of(self, study: str, task: str) -> Curves:
         """Curves of a study that the paper does not have."""
-        rulers = self.rulers.get(task, ())
-        return Curves(study=study, title=f"Study {study}: learning curves", place="", yardsticks=rulers, levels={})
+        yardsticks = self.yardsticks.get(task, ())
+        return Curves(study=study, title=f"Study {study}: learning curves", place="", yardsticks=yardsticks, levels={})
 
 
 def read(path: Path | None = None) -> Paper:

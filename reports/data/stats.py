@@ -45,19 +45,19 @@ class Interval(NamedTuple):
 
     @property
     def few(self) -> bool:
-        """Whether the interval rests on too few seeds to be trusted at its nominal level."""
+        """True if the interval rests on too few seeds to be trusted at its nominal level."""
         return self.n < FEW
 
     def above(self, x: float) -> bool:
-        """Whether the whole interval lies above x. False when there is no interval."""
+        """True if the whole interval lies above x. False when there is no interval."""
         return bool(self.low > x)
 
     def below(self, x: float) -> bool:
-        """Whether the whole interval lies below x. False when there is no interval."""
+        """True if the whole interval lies below x. False when there is no interval."""
         return bool(self.high < x)
 
     def holds(self, x: float) -> bool:
-        """Whether x lies in the interval. False when there is no interval."""
+        """True if x lies in the interval. False when there is no interval."""
         return bool(self.low <= x <= self.high)
 
 
@@ -215,7 +215,7 @@ def _means(table: pd.DataFrame, n: int) -> pd.DataFrame:
 
 
 def _score_bound(value: float, n: int, m: int, end: float) -> float:
-    """Where the score interval of U / (n m) ends towards `end`, 0 or 1."""
+    """The value at which the score interval of U / (n m) ends towards `end`, 0 or 1."""
     if abs(value - end) < 1e-12:
         return end
     z, half = float(norm.ppf((1 + LEVEL) / 2)), (n + m) / 2 - 1

@@ -34,12 +34,12 @@ MADE = ("figures", TABLES, MEASURED, "claims.md", "claims.csv", "claims.json", "
 DEFINITIONS = (
     (
         "Final return",
-        "mean over seeds of final/return, the greedy policy after the last step on a bank of {episodes} that no curve "
+        "mean over seeds of final/return, the greedy policy after the last step in {episodes} that no curve "
         "uses. Coverage: 100 × mean reward per step; navigation: sum over an episode.",
     ),
     (
         "Curve",
-        "mean over seeds of eval/return, the greedy policy on a smaller fixed bank, on one grid of steps. Faint where "
+        "mean over seeds of eval/return, the greedy policy in fewer fixed episodes, on one grid of steps. Faint where "
         "fewer seeds have come so far.",
     ),
     (
@@ -91,6 +91,7 @@ class Built(NamedTuple):
 
     files: list[Path]
     undrawn: list[str]
+    note: str = ""  # on tables of an older version
 
 
 def build(runs: Path, out: Path, profile: str, study: str | None = None) -> Built:
@@ -121,7 +122,7 @@ def build(runs: Path, out: Path, profile: str, study: str | None = None) -> Buil
     except OSError as error:
         raise OutError(f"{error.filename or out}: cannot be written ({error.strerror or error})") from error
     files = sorted(path for name in names for path in [out / name, *(out / name).rglob("*")] if path.is_file())
-    return Built(files, _undrawn(written))
+    return Built(files, _undrawn(written), results.set_aside)
 
 
 @contextmanager
@@ -165,7 +166,7 @@ def main(argv: Sequence[str] | None = None, shown: Callable[[str], str] = str) -
     except (TableError, PaperError, OutError) as error:
         print(shown(str(error)), file=sys.stderr)
         return BAD
-    for line in built.undrawn:
+    for line in [*built.undrawn, *([f"note: {built.note}"] if built.note else [])]:
         print(shown(line), file=sys.stderr)
     print(shown(f"{len(built.files)} files; start with {out / 'index.html'}"))
     return UNDRAWN if built.undrawn else DONE
@@ -192,7 +193,7 @@ def _single(results: Results, paper: Paper, study: str) -> Report:
 
 
 def definitions(results: Results) -> list[tuple[str, str]]:
-    """What the words mean, with the size of the final bank."""
+    """The meaning of the words, with the number of final evaluation episodes."""
     counts = sorted({n for study in results.studies if (n := results.final_episodes(study))})
     episodes = f"{' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))} episodes" if counts else "episodes"
     return [(name, words.replace("{episodes}", episodes)) for name, words in DEFINITIONS]
@@ -269,7 +270,7 @@ def _last(results: Results) -> dict[str, Table]:
 
 
 def _study_tables(results: Results, study: str) -> dict[str, Table]:
-    """What is shown of every study."""
+    """The tables that every study has."""
     found = scaling.sweep(results, study)
     steadiness = tables.steadiness(results, study)
     every: dict[str, Table | None] = {
@@ -294,6 +295,8 @@ def _index(report: Report) -> Iterator[str]:
     results = report.results
     yield f"# {markdown(report.title)}\n"
     yield "The same with everything in one page: `index.html`.\n"
+    if results.set_aside:
+        yield f"**{results.set_aside}**\n"
     yield f"{_summary(results)}\n"
     if report.short:
         yield "\n".join(f"- {markdown(line)}" for line in report.short) + "\n"
@@ -342,12 +345,13 @@ def _links(folder: str, name: str, first: str, second: str) -> str:
 
 
 def _content(report: Report, pictures: Path) -> Mapping[str, Any]:
-    """What the page shows, by the names of its template."""
+    """The content of the page, by the names of its template."""
     results = report.results
     runs = report.tables["runs"]
     return {
         "title": report.title,
         "lead": report.lead,
+        "aside": words(results.set_aside),
         "short": report.short,
         "folded": page.FOLDED,
         "tally": page.verdicts(report.claims),
@@ -359,7 +363,7 @@ def _content(report: Report, pictures: Path) -> Mapping[str, Any]:
         "provenance": page.provenance(results),
         "made": page.grid("provenance", report.tables["provenance"]),
         "runs": page.grid("runs", runs),
-        "counted": "runs" if set(results.runs["study"]) <= set(results.studies) else "runs, with scripted policies",
+        "counted": "runs" if set(results.runs["study"]) <= set(results.studies) else "runs, with yardsticks",
         "ids": [f"run-{stem(run)}" if first else "" for run, first in _first_seen(runs)],
         "foot": f"Built from the exported tables of profile {results.profile}; the same tables give the same page.",
     }
@@ -387,14 +391,12 @@ def _sections(report: Report, pictures: Path) -> list[page.Section]:
         for names in [tuple(name for name, owner in of_table.items() if owner == study)]
     ]
     rest = tuple(name for name in report.tables if name not in of_table and name not in ("table_1", *LAST))
-    whole.append(
-        _section(report, pictures, "scale", "Scripted policies, bounds, transfer, encoder, Theorem 1", "-", rest)
-    )
+    whole.append(_section(report, pictures, "scale", "Yardsticks, transfer, encoder, Theorem 1", "-", rest))
     return [section for section in whole if section.plates or section.grids]
 
 
 def _of_study(name: str) -> str:
-    """What follows the kind of a study's table in its name."""
+    """The part of a table's name that follows its kind."""
     kind, _, rest = name.partition("_")
     return rest if kind in KINDS else ""
 
@@ -412,13 +414,13 @@ def _section(report: Report, pictures: Path, name: str, title: str, study: str, 
 
 
 def _parted(found: Mapping[str, Part]) -> tuple[list[Part], list[Part]]:
-    """What is shown at once, and what is folded away."""
+    """The parts that are shown at once, and those that are folded away."""
     shown = [x for key, x in found.items() if not _folded(key)]
     return shown, [x for key, x in found.items() if _folded(key)]
 
 
 def _folded(name: str) -> bool:
-    """Whether a figure or a table is folded away: what looks at the same runs in yet another way."""
+    """True if a figure or a table is folded away: what looks at the same runs in yet another way."""
     return name.startswith(MORE) or name.endswith("_arms")
 
 
@@ -437,7 +439,7 @@ def _question(results: Results, study: str) -> str:
 
 
 def _lead(results: Results) -> str:
-    """How much is behind the report, in a sentence or two."""
+    """The amount of data behind the report, in a sentence or two."""
     runs = results.runs[results.runs["study"].isin(results.studies)]
     done, budgets = int((runs["status"] == "finished").sum()), [results.budget(study) for study in results.studies]
     known = sorted({budget for budget in budgets if budget})
@@ -474,7 +476,7 @@ def _origin(results: Results) -> str:
 
 
 def _count(claims: Table) -> str:
-    """How many claims got each verdict."""
+    """The number of claims with each verdict."""
     counts = claims.numbers["verdict"].value_counts()
     parts = [f"{counts[verdict]} {verdict}" for verdict in VERDICTS if verdict in counts]
     return f"Of {len(claims.numbers)} claims: {', '.join(parts)}."

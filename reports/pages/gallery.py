@@ -42,7 +42,7 @@ class Picture(NamedTuple):
 
 
 def reason(error: Exception) -> str:
-    """What went wrong with a figure, on one line."""
+    """The fault of a figure, on one line."""
     return f"{type(error).__name__}: {' '.join(str(error).split())}".removesuffix(": ")
 
 
@@ -71,7 +71,7 @@ def gallery(results: Results, paper: Paper) -> list[Picture]:
 
 
 def in_short(results: Results, paper: Paper) -> list[str]:
-    """What came out, a sentence for each of the paper's comparisons that has runs."""
+    """The outcome, a sentence for each of the paper's comparisons that has runs."""
     lines = []
     for spec in paper.figures.values():
         arms = comparison.compared(results, spec.study)
@@ -99,7 +99,7 @@ def study_gallery(results: Results, paper: Paper, study: str) -> list[Picture]:
 
 
 def comparisons(results: Results) -> Iterator[Picture]:
-    """What the paper does not have: assignments, performance profiles, probabilities of improvement, transfer."""
+    """Figures that the paper lacks: assignments, performance profiles, probabilities of improvement, transfer."""
     for study in results.studies:
         made = f"rhmc assignments studies/{study.partition('@')[0]}.yaml --profile {results.profile}"
         title = f"What is assigned while training, study {study}"
@@ -149,7 +149,7 @@ def _moved(results: Results) -> Made | None:
 
 
 def curve_caption(results: Results, study: str) -> str:
-    """What to see in the curves of a study, from its numbers."""
+    """The result that the curves of a study show, from its numbers."""
     arms = comparison.compared(results, study)
     waiting = [arm for arm in results.arms(study) if not len(results.finals(study, arm))]
     words = f" No finished run yet: {joined(waiting)}." if waiting else ""

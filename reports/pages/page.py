@@ -83,7 +83,7 @@ class Section(NamedTuple):
 
     @property
     def more(self) -> str:
-        """What is folded away, in words."""
+        """The parts that are folded away, in words."""
         figures = [plate.heading.partition(", study ")[0] for plate in self.more_plates]
         sheets = [grid.title.partition(" study ")[0].removesuffix(",").removesuffix(" in") for grid in self.more_grids]
         return ", ".join(word[:1].lower() + word[1:] for word in figures + sheets)
@@ -120,7 +120,7 @@ def episode(task: str, gif: bytes) -> Plate:
 
 
 def animation_fault(gif: bytes) -> str:
-    """Why a file is no animation; nothing if it is one."""
+    """The reason why a file is no animation; nothing if it is one."""
     whole = gif[:6] in (b"GIF87a", b"GIF89a") and gif[-1:] == b";" and any(gif[6:8]) and any(gif[8:10])
     return "" if whole else f"the file is not a whole GIF ({len(gif)} bytes)"
 
@@ -139,7 +139,7 @@ def cell(text: str) -> Cell:
 
 
 def sort_key(text: str) -> str:
-    """What a cell is sorted by: its leading number in full, or its words; nothing where there is nothing to show."""
+    """The sort key of a cell: its leading number in full, or its words; nothing where there is nothing to show."""
     if text in (NONE, "", "missing", "nan"):
         return ""
     found = NUMBER.match(text.replace("−", "-"))
@@ -149,7 +149,7 @@ def sort_key(text: str) -> str:
 
 
 def verdicts(claims: Sequence[Claim]) -> list[dict[str, Any]]:
-    """How many claims got each verdict, and how many of them are provisional."""
+    """The number of claims with each verdict, and the number of them that are provisional."""
     found = []
     for verdict in VERDICTS:
         mine = [claim for claim in claims if claim.verdict == verdict]
@@ -167,7 +167,7 @@ def card(claim: Claim) -> dict[str, Any]:
 
 
 def provenance(results: Results) -> list[tuple[str, str]]:
-    """What made the runs: names and values."""
+    """The provenance of the runs: names and values."""
     runs = results.runs
     known = sorted(set(runs["fingerprint"].dropna().astype(str)) - {""})
     spent = duration(float(runs["seconds"].sum())) if runs["seconds"].notna().any() else "not exported"

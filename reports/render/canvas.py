@@ -1,4 +1,4 @@
-"""What all figures share: colours, style, the empty figure, and how a figure becomes files. Same input, same bytes."""
+"""Parts that all figures share: colours, style, the empty figure, the writing of files. Same input, same bytes."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from reports.data.escaping import cell
-from reports.render import glyphs as letters
+from reports.render import glyphs
 
 # One colour and line per arm, everywhere. They differ in lightness as well, for colour-blind readers and grey print,
 # and every curve is named at its end.
@@ -67,7 +67,7 @@ class Drawing(NamedTuple):
 @contextmanager
 def styled() -> Iterator[None]:
     """Draw in the project's style, whatever the machine's settings are."""
-    with style.context(["default", STYLE | letters.settings()]):
+    with style.context(["default", STYLE | glyphs.settings()]):
         yield
 
 
@@ -94,7 +94,7 @@ def save(drawing: Drawing, folder: Path, name: str) -> bool:
     """Write `<name>.csv`, then `.png` and `.pdf`, to a folder. Whether a letter is in no font, see `letters`."""
     write_csv(drawing.numbers, folder / f"{name}.csv", digits="%.6g")
     with styled():
-        lost = letters.settle(drawing.figure)
+        lost = glyphs.settle(drawing.figure)
         drawing.figure.savefig(folder / f"{name}.png", metadata={"Software": None})
         drawing.figure.savefig(
             folder / f"{name}.pdf", metadata={"CreationDate": None, "Creator": None, "Producer": None}

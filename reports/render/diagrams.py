@@ -34,7 +34,7 @@ class Flow(NamedTuple):
 
     @property
     def columns(self) -> int:
-        """How many columns there are."""
+        """The number of columns."""
         return 1 + max(box.column for box in self.boxes.values())
 
     def rows(self, column: int) -> list[str]:

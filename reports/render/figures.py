@@ -43,12 +43,12 @@ class Label(NamedTuple):
 
     @property
     def lines(self) -> int:
-        """How many lines they take."""
+        """The number of lines that they take."""
         return self.text.count("\n") + 1
 
 
 def learning_curves(results: Results, spec: Curves) -> Drawing | None:
-    """Every arm of the study with its 95 % band, scripted policies and the paper's levels as lines.
+    """Every arm of the study with its 95 % band, yardsticks and the paper's levels as lines.
 
     Returns:
         None if the study has no points at all.
@@ -57,9 +57,9 @@ def learning_curves(results: Results, spec: Curves) -> Drawing | None:
     curves = _curves(results, spec.study)
     if not curves:
         return None
-    rulers = _rulers(results, spec)
+    yardsticks = _yardsticks(results, spec)
     levels = {arm: spec.levels[arm] for arm in arms if arm in spec.levels}
-    labels = _ruler_labels(rulers) + _level_labels(levels) + _curve_labels(curves, results, spec.study)
+    labels = _yardstick_labels(yardsticks) + _level_labels(levels) + _curve_labels(curves, results, spec.study)
     entries = ["\n".join(wrap(f"{arm} ({_seed_words(results, spec, arm)})", LEGEND)) for arm in arms]
     columns = min(5, max(1, LEGEND // (max(map(len, entries)) + 8)))
     rows = -(-len(arms) // columns) + sum(entry.count("\n") for entry in entries)
@@ -68,7 +68,7 @@ def learning_curves(results: Results, spec: Curves) -> Drawing | None:
         height = HEAD + ROW * rows + tall + FOOT
         figure = blank(WIDTH, height)
         axes = figure.add_axes((LEFT, FOOT / height, SHARE, tall / height))
-        _draw_rulers(axes, rulers)
+        _draw_yardsticks(axes, yardsticks)
         _draw_levels(axes, levels)
         for arm in reversed(list(curves)):  # the first arm on top
             _draw_curve(axes, curves[arm], *look(arm, arms))
@@ -77,7 +77,7 @@ def learning_curves(results: Results, spec: Curves) -> Drawing | None:
         head(figure, spec.title, describe_task(results.env(spec.study)))
         _legend(figure, axes, dict(zip(arms, entries, strict=True)), columns, (height - HEAD) / height)
         foot(figure, footer(results, spec))
-    return Drawing(figure, _numbers(curves, rulers, levels))
+    return Drawing(figure, _numbers(curves, yardsticks, levels))
 
 
 def each_arm(results: Results, spec: Curves) -> Drawing | None:
@@ -144,7 +144,7 @@ def spread(heights: Sequence[float], gap: float | Sequence[float], low: float, h
 def footer(results: Results, spec: Curves, *, levels: bool = True) -> str:
     """Profile, budget and seeds; what band and labels are; the code's fingerprint.
 
-    levels: whether the figure shows the paper's values and the scripted policies.
+    levels: whether the figure shows the paper's values and the yardsticks.
     """
     plan = results.plan(spec.study)
     counts = sorted({len(results.plan(spec.study, arm)) for arm in results.arms(spec.study)})
@@ -159,7 +159,9 @@ def footer(results: Results, spec: Curves, *, levels: bool = True) -> str:
     names += (
         ["dotted: the paper's values"] if levels and any(arm in spec.levels for arm in results.arms(spec.study)) else []
     )
-    names += ["grey: scripted policies without learning, and bounds"] if levels and _rulers(results, spec) else []
+    names += (
+        ["grey: yardsticks (policies without learning, and bounds)"] if levels and _yardsticks(results, spec) else []
+    )
     return f"{first}  ·  code {prints}\n{lines}\n{'; '.join(names)}"
 
 
@@ -168,15 +170,15 @@ def _curves(results: Results, study: str) -> dict[str, pd.DataFrame]:
     return {arm: rows for arm in results.arms(study) if len(rows := results.mean_curve(study, arm))}
 
 
-def _rulers(results: Results, spec: Curves) -> dict[str, float]:
+def _yardsticks(results: Results, spec: Curves) -> dict[str, float]:
     table = results.yardsticks_of(spec.study)
     if FINAL not in table:
         return {}
     return {name: float(table[FINAL][name]) for name in spec.yardsticks if name in table.index}
 
 
-def _ruler_labels(rulers: Mapping[str, float]) -> list[Label]:
-    return [Label(y, f"{readable(name)} {number(y)}", QUIET, False) for name, y in rulers.items()]
+def _yardstick_labels(yardsticks: Mapping[str, float]) -> list[Label]:
+    return [Label(y, f"{readable(name)} {number(y)}", QUIET, False) for name, y in yardsticks.items()]
 
 
 def _level_labels(levels: Mapping[str, float]) -> list[Label]:
@@ -207,8 +209,8 @@ def _level_colour(arms: Sequence[str]) -> str:
     return look(arms[0], arms)[0] if len(arms) == 1 else QUIET
 
 
-def _draw_rulers(axes: Axes, rulers: Mapping[str, float]) -> None:
-    for name, y in rulers.items():
+def _draw_yardsticks(axes: Axes, yardsticks: Mapping[str, float]) -> None:
+    for name, y in yardsticks.items():
         axes.axhline(y, color=FAINT, linewidth=1, linestyle=(0, (6, 2)) if name.endswith("_bound") else "-", zorder=1)
 
 
@@ -276,12 +278,12 @@ def _seed_words(results: Results, spec: Curves, arm: str) -> str:
 
 
 def _numbers(
-    curves: Mapping[str, pd.DataFrame], rulers: Mapping[str, float], levels: Mapping[str, float]
+    curves: Mapping[str, pd.DataFrame], yardsticks: Mapping[str, float], levels: Mapping[str, float]
 ) -> pd.DataFrame:
     parts = [
         rows.rename(columns={"mean": "value", "n": "seeds"}).assign(kind="curve", name=arm)
         for arm, rows in curves.items()
     ]
-    lines = [("paper", *item) for item in levels.items()] + [("yardstick", *item) for item in rulers.items()]
+    lines = [("paper", *item) for item in levels.items()] + [("yardstick", *item) for item in yardsticks.items()]
     parts += [pd.DataFrame(lines, columns=["kind", "name", "value"])] if lines else []
     return pd.concat(parts, ignore_index=True)[["kind", "name", "step", "value", "low", "high", "seeds"]]

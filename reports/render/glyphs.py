@@ -34,7 +34,7 @@ def families() -> tuple[str, ...]:
 
 
 def settings() -> Any:  # a mapping, as matplotlib types it
-    """What a figure with words of users is drawn under."""
+    """The settings under which a figure with words of users is drawn."""
     return {"text.parse_math": False, "font.family": list(families())}
 
 
@@ -70,7 +70,7 @@ def readable(text: str, font: FontProperties) -> str:
 
 
 def _invisible(sign: str) -> bool:
-    """Whether nothing of it is seen: marks that join, order or vary the letters beside them."""
+    """True if nothing of it is seen: marks that join, order or vary the letters beside them."""
     return unicodedata.category(sign) == "Cf" or "\ufe00" <= sign <= "\ufe0f" or "\U000e0100" <= sign <= "\U000e01ef"
 
 

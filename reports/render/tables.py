@@ -43,7 +43,7 @@ class Table(NamedTuple):
 
 
 def table_1(results: Results) -> Table:
-    """What the methods are, in the order of the code's table; parameters of the networks that act and of all."""
+    """Properties of the methods, in the order of the code's table; parameters of the networks that act and of all."""
     numbers, shown, tasks = [], [], []
     for method in results.methods:
         row = {name: method[name] for name in METHOD} | {"actions": ", ".join(method["actions"])}
@@ -134,7 +134,7 @@ def finals(results: Results, study: str) -> Table:
 
 
 def steadiness(results: Results, study: str) -> Table:
-    """Whether arms keep what they have learned: the curve's mean at a quarter of the budget, its best and its last."""
+    """The steadiness of arms: the curve's mean at a quarter of the budget, its best and its last."""
     numbers, shown = [], []
     for arm in results.arms(study):
         points = results.curve(study, arm)
@@ -167,7 +167,7 @@ def steadiness(results: Results, study: str) -> Table:
 
 
 def yardsticks(results: Results) -> Table:
-    """Scripted policies and bounds of every task: mean, standard error in brackets."""
+    """Yardsticks of every task: mean, standard error in brackets."""
     numbers, shown = [], []
     for task, table in results.yardsticks:
         names = [name for name in table.columns if not name.endswith("_sem")]
@@ -175,11 +175,11 @@ def yardsticks(results: Results) -> Table:
             numbers.append({"task": describe_task(task), "policy": row["arm"]} | {k: row[k] for k in table.columns})
             cells = {_title(name): _with_error(row[name], row.get(f"{name}_sem", np.nan)) for name in names}
             shown.append({"Task": describe_task(task), "Policy": readable(str(row["arm"]))} | cells)
-    return Table("Scripted policies and bounds", pd.DataFrame(numbers), pd.DataFrame(shown).fillna(NONE))
+    return Table("Yardsticks", pd.DataFrame(numbers), pd.DataFrame(shown).fillna(NONE))
 
 
 def theorem(results: Results) -> Table | None:
-    """How often Algorithm 1 falls short, by size and density; None if it was not tried."""
+    """The shortfall of Algorithm 1, by size and density; None if it was not tried."""
     table = results.theorem.reset_index()
     if table.empty:
         return None
@@ -201,7 +201,7 @@ def theorem(results: Results) -> Table | None:
 
 
 def provenance(results: Results) -> Table:
-    """What made the runs of every study: code, commit, machine, libraries, time."""
+    """The provenance of the runs of every study: code, commit, machine, libraries, time."""
     numbers, shown = [], []
     for study, rows in results.runs.groupby("study"):
         known = {name: sorted(set(rows[name].dropna().astype(str)) - {""}) for name in ("fingerprint", "commit", *TOLD)}
@@ -230,7 +230,7 @@ def provenance(results: Results) -> Table:
 
 
 def made(results: Results) -> Table:
-    """How and where every planned run was made."""
+    """The machine and code that made every planned run."""
     rows = results.runs.sort_values(list(PLACE), kind="stable")
     numbers = rows[[*PLACE, *OWN]].reset_index(drop=True)
     shown = numbers[list(PLACE)].assign(
@@ -279,7 +279,7 @@ def readable(name: str) -> str:
 
 
 def seeds(results: Results, study: str, arm: str) -> str:
-    """How many seeds are finished: `3`, `2 of 3`, or `missing`."""
+    """The number of finished seeds: `3`, `2 of 3`, or `missing`."""
     done, planned = len(results.finished(study, arm)), len(results.plan(study, arm))
     if not planned:
         return "missing"

@@ -37,7 +37,7 @@ ABOUT = About(
 
 
 class Config(coordinator.Config, executor.Config, Replayed):
-    """Settings; those that the text gives (lr, gammas, Algorithms 1 and 2 to the letter) are the defaults."""
+    """Settings; those that the text gives (lr, gammas, Algorithms 1 and 2 as printed) are the defaults."""
 
     kind: Literal["rhmc"] = "rhmc"
     regulator: Literal["none", "paper", "exact"] = "paper"

@@ -64,7 +64,7 @@ def none(options: Tensor, assignment: Tensor, alpha: float) -> Tensor:
 
 
 def paper(options: Tensor, assignment: Tensor, alpha: float) -> Tensor:
-    """Algorithm 1 to the letter. It can fall short of the optimum (`rhmc.hierarchy.theorem`).
+    """Algorithm 1 as printed. It can fall short of the optimum (`rhmc.hierarchy.theorem`).
 
     Args:
         options: (B, N, D, M) bool.

@@ -1,4 +1,4 @@
-"""What every method must satisfy; and the comparison of full states that the tests of a resume rest on."""
+"""The requirements on every method; and the comparison of full states that the tests of a resume rest on."""
 
 from typing import Any
 

@@ -1,6 +1,5 @@
-"""What every method of the table must do, on both encoders and both tasks; and RHMC in its variants."""
+"""The requirements on every method of the table, on both encoders and both tasks; and RHMC in its variants."""
 
-import io
 from functools import cache
 from itertools import product
 from operator import attrgetter
@@ -22,6 +21,7 @@ from rhmc.types import Batch, Obs, Transition
 from tests import toy
 from tests.blocks import fields, fitted, flat, nested
 from tests.conformance import DifferentError, assert_same
+from tests.support import seeded, through_a_file
 
 EPISODE = 7  # of both tasks here, so that runs of a few steps cross its end
 SMALL = {
@@ -123,14 +123,6 @@ def trainer(case: Case, seed: int = 0) -> Trainer:
     return Trainer(case.env, case.algo, RUN, seed)
 
 
-def through_a_file(state: Any) -> Any:
-    """What a checkpoint is after it was written and read, by the reader that runs no code."""
-    file = io.BytesIO()
-    torch.save(state, file)
-    file.seek(0)
-    return torch.load(file, weights_only=True)
-
-
 # Resume
 
 
@@ -219,7 +211,7 @@ def learners(thing: Any) -> list[Learner[Any]]:
 
 
 def parts(thing: Any) -> dict[str, Any]:
-    """What hangs on an object of the project, its settings aside."""
+    """The attributes of an object of the project, its settings aside."""
     ours = type(thing).__module__.startswith("rhmc") and hasattr(thing, "__dict__")
     return {key: value for key, value in vars(thing).items() if key != "cfg"} if ours else {}
 
@@ -372,10 +364,6 @@ def at_random(env: Env) -> Tensor:
     if env.spec.continuous:
         return torch.rand(*shape, env.spec.actions) * 2 - 1
     return torch.randint(env.spec.actions, shape)
-
-
-def seeded(seed: int = 3) -> Generator:
-    return Generator().manual_seed(seed)
 
 
 @every
@@ -633,7 +621,7 @@ ON_POLICY = {
 @pytest.mark.parametrize("flag", ["terminated", "truncated", None])
 @pytest.mark.parametrize("case", ON_POLICY.values(), ids=ON_POLICY)
 def test_a_sequence_stops_where_an_episode_ends(case: Case, flag: str | None) -> None:
-    """What happens in the next episode is nothing to the step before; within an episode it is."""
+    """The next episode does not affect the step before; within an episode it is."""
     env, obs = world(case.env, batch=1)
     found = []
     for shift in (0.0, 1.0):

@@ -20,8 +20,8 @@ from pipelines.tracking.tracker import MemoryTracker
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import ENVS
 from rhmc.learning.learner import Learner
-from rhmc.scripted.yardsticks import yardsticks
 from rhmc.training.trainer import Trainer
+from rhmc.yardsticks.scores import play_yardsticks
 from tests.blocks import fitted, flat, nested
 from tests.pipelines.support import tiny
 
@@ -55,7 +55,7 @@ VARIANTS: dict[str, dict[str, Any]] = {  # beside every method in every task
 
 
 def cases() -> dict[str, Callable[[], str]]:
-    """What is digested, by name; calling one takes a second or two."""
+    """The cases that are digested, by name; calling one takes a second or two."""
     kinds = {kind: {"kind": kind} for kind in ALGORITHMS} | VARIANTS
     found = {f"{name} in {task}": _training(task, algo) for name, algo in kinds.items() for task in ENVS}
     found["maddpg in continuous navigation"] = _training("navigation", {"kind": "maddpg"}, continuous=True)
@@ -88,7 +88,7 @@ def _learned(learner: Learner[Any]) -> dict[str, Any]:
 
 
 def _yardsticks(task: str) -> Callable[[], str]:
-    return lambda: digest(yardsticks(ENVS[task].config(), episodes=4, seed=1))
+    return lambda: digest(play_yardsticks(ENVS[task].config(), episodes=4, seed=1))
 
 
 def _table() -> str:

@@ -22,7 +22,7 @@ class Target:
     visited: list[Point] = field(default_factory=list)  # where it stood at its decisions, latest last
 
     def decide(self, draws: Draws, dt: float) -> Point:
-        """Where it wants to go now. Asked again at the same place it has not moved, and so changes its mind."""
+        """The point where it wants to go now. Asked again at the same place it has not moved, and chooses another."""
         self.counter += 1
         moved = min((math.dist(self.position, p) for p in self.visited[-2:]), default=30.0)
         self.visited.append(self.position)
@@ -54,7 +54,7 @@ class World:
         return math.dist(self.sensors[i], self.targets[j].position)
 
     def sees(self, i: int, j: int) -> bool:
-        """Whether target j is in the field of view of sensor i."""
+        """True if target j is in the field of view of sensor i."""
         return -45 < self.bearing(i, j) < 45 and self.distance(i, j) <= 800
 
     def turn(self, actions: list[int]) -> None:
@@ -72,7 +72,7 @@ def wrapped(degrees: float) -> float:
 
 
 def inside(point: Point) -> bool:
-    """Whether a target may be here."""
+    """True if a target may be here."""
     return max(abs(point[0]), abs(point[1])) <= 1250
 
 
@@ -100,7 +100,7 @@ def local_reward(world: World, i: int, action: int, own: list[bool]) -> float:
 
 
 def paper_features(world: World, i: int, j: int) -> list[float]:
-    """What the paper lets sensor i know about target j."""
+    """The observation of sensor i in the paper about target j."""
     n, m = len(world.sensors), len(world.targets)
     return [i / n, j / m, world.bearing(i, j) / 180, world.distance(i, j) / 2000]
 

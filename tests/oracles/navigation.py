@@ -70,7 +70,7 @@ def completed(world: World) -> list[list[bool]]:
 
 
 def extended_pair(world: World, i: int, j: int) -> list[float]:
-    """What agent i sees of landmark j in the extended observation."""
+    """The observation by agent i of landmark j in the extended observation."""
     own = math.dist(world.position[i], world.landmarks[j])
     others = [math.dist(p, world.landmarks[j]) for k, p in enumerate(world.position) if k != i]
     dx, dy = (world.landmarks[j][a] - world.position[i][a] for a in range(2))
@@ -78,7 +78,7 @@ def extended_pair(world: World, i: int, j: int) -> list[float]:
 
 
 def extended_peer(world: World, i: int, k: int) -> list[float]:
-    """What agent i sees of agent k in the extended observation."""
+    """The observation by agent i of agent k in the extended observation."""
     away = [world.position[k][a] - world.position[i][a] for a in range(2)]
     drift = [world.velocity[k][a] - world.velocity[i][a] for a in range(2)]
     return [*away, math.dist(world.position[i], world.position[k]), *drift]

@@ -22,7 +22,7 @@ def reward(completed: Completed, assignment: Assignment, alpha: float) -> float:
 
 
 def joint_options(options: Options, assignment: Assignment) -> Iterator[Completed]:
-    """What every joint option completes."""
+    """The targets that every joint option completes."""
     agents, targets = range(len(options)), range(len(assignment[0]))
     for joint in product(*(range(len(row)) for row in options)):
         yield [any(options[i][joint[i]][j] and assignment[i][j] for i in agents) for j in targets]

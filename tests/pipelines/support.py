@@ -92,7 +92,7 @@ def jobs_of(module: str, monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 def started_by(driver: int, name: str = "") -> list[psutil.Process]:
-    """What runs in the session of a driver, which may be gone, and has `name` in its command line."""
+    """The processes in the session of a driver, which may be gone, and has `name` in its command line."""
     found = []
     for process in psutil.process_iter():
         with suppress(psutil.Error, OSError):

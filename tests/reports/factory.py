@@ -8,12 +8,15 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 
+from pipelines.export.tables import RUNS as RUNS_OF_NOW
 from reports.data.frame import METHOD, METHODS, OWN, PLACE, POINTS, RUNS
 
 COVERAGE = {"kind": "coverage", "preset": "flat", "agents": 4, "targets": 5, "observation": "extended"}
 NAVIGATION = {"kind": "navigation", "agents": 3, "reward": "paper"}
-SCRIPTED = {
+YARDSTICK_RETURNS = {
     "random": 30.4,
     "nearest": 60.6,
     "best_window": 65.3,
@@ -68,9 +71,9 @@ def study(
 
 
 def yardsticks(
-    values: Mapping[str, float] = SCRIPTED, env: Mapping[str, Any] = COVERAGE, profile: str = "quick"
+    values: Mapping[str, float] = YARDSTICK_RETURNS, env: Mapping[str, Any] = COVERAGE, profile: str = "quick"
 ) -> Tables:
-    """Scripted policies, standard error 0.3."""
+    """Yardsticks, standard error 0.3."""
     points, runs = study("yardsticks", {name: [value] for name, value in values.items()}, env=env, profile=profile)
     points = points[points["metric"].str.startswith("final/")].assign(step=0)
     errors = points.assign(metric=points["metric"] + "_sem", value=0.3)
@@ -92,7 +95,7 @@ def theorem(lost: int = 40) -> Tables:
 
 
 def methods(folder: Path, names: Sequence[str] = ("RHMC", "IQL")) -> Path:
-    """What `rhmc methods --out` writes: sizes 1000 k + 10 for the k-th method, 5 more for each next encoder or task."""
+    """Output of `rhmc methods --out`: sizes 1000 k + 10 for the k-th method, 5 more for each next encoder or task."""
     records = []
     for k, name in enumerate(names, 1):
         texts = {key: f"{key} of {name}" for key in METHOD} | {"kind": name.lower(), "name": name}
@@ -126,7 +129,8 @@ def write(folder: Path, *tables: Tables) -> Path:
             own = [column for column in OWN if column in runs]
             made = runs[[*PLACE, *own]].reindex(columns=[*PLACE, *OWN], fill_value="")
             made.to_parquet(folder / f"{name}.made.parquet", index=False)
-            runs.drop(columns=own).to_parquet(folder / f"{name}.runs.parquet", index=False)
+            table = pa.Table.from_pandas(runs.drop(columns=own), preserve_index=False)
+            pq.write_table(table.replace_schema_metadata(RUNS_OF_NOW.metadata), folder / f"{name}.runs.parquet")
     return folder
 
 
@@ -136,7 +140,7 @@ def noisy(mean: float, n: int = 3, spread: float = 1.0) -> list[float]:
 
 
 def drawings(folder: Path) -> Path:
-    """What `rhmc drawings --out` writes, small: a chain and a branched network per role, two states, one instance."""
+    """The output of `rhmc drawings --out`, small: a chain and a branched network per role, two states, one instance."""
     folder.mkdir(parents=True, exist_ok=True)
     builds = [
         {
@@ -219,14 +223,14 @@ def _network(role: str) -> dict[str, Any]:
 
 
 def episode(folder: Path) -> Path:
-    """What `rhmc render` writes, the smallest: a GIF of two by one pixels."""
+    """The output of `rhmc render`, the smallest: a GIF of two by one pixels."""
     gif = bytes.fromhex("47494638396102000100800000ffffff00000021f90400000000002c00000000020001000002020c0a003b")
     (folder / "episode_coverage.gif").write_bytes(gif)
     return folder
 
 
 def assignments(points: pd.DataFrame, arm: str, pairs: Sequence[float], lost: Sequence[float]) -> pd.DataFrame:
-    """What `rhmc assignments` writes of an arm's first run: a point at every 1000 steps."""
+    """The output of `rhmc assignments` of an arm's first run: a point at every 1000 steps."""
     place = points[points["arm"] == arm].iloc[0][["study", "arm", "seed", "run"]].to_dict()
     rows = [
         place | {"step": 1000 * (n + 1), "metric": f"assign/{name}", "value": value}
@@ -240,7 +244,7 @@ def assignments(points: pd.DataFrame, arm: str, pairs: Sequence[float], lost: Se
 
 
 def transfer(points: pd.DataFrame, levels: Mapping[tuple[int, int], float], arm: str = "RHMC") -> pd.DataFrame:
-    """What `rhmc transfer` writes: every seed of an arm a point apart at each size."""
+    """The output of `rhmc transfer`: every seed of an arm a point apart at each size."""
     runs = points[points["arm"] == arm].drop_duplicates("run")
     rows = [
         (r.study, r.arm, r.seed, r.run, "coverage flat", n, m, 4, 5, 200, level + float(str(r.seed)), 0.5)

@@ -32,7 +32,7 @@ QUESTION = r"Is $\x$ <b>better</b> than a|b, **really** & _truly_?"
 
 
 def markdown_words(text: str) -> str:
-    """What a reader sees of a Markdown page: a cell or a paragraph a line, a tag or a picture marked as such."""
+    """The visible text of a Markdown page: a cell or a paragraph a line, a tag or a picture marked as such."""
     parser = MarkdownIt("commonmark").enable(["table", "strikethrough"])
     return "\n".join(_words(token) for token in parser.parse(text) if token.type in ("inline", "html_block"))
 

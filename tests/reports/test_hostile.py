@@ -16,12 +16,11 @@ from matplotlib.legend import Legend
 from matplotlib.text import Text
 
 from reports.analyses import beyond, comparison, scaling
-from reports.data import escaping as escape
+from reports.data import escaping
 from reports.data.frame import Results, load
 from reports.data.paper import read
 from reports.pages.build import Built, build
-from reports.render import figures
-from reports.render import glyphs as letters
+from reports.render import figures, glyphs
 from reports.render.canvas import Drawing, blank, save, styled
 from tests.reports.factory import COVERAGE, assignments, noisy, study, write, yardsticks
 from tests.reports.hostile import NAMES, QUESTION, Page, csv_words, latex_rows, markdown_words
@@ -89,12 +88,12 @@ def test_latex(made: Path) -> None:
 def test_csv_has_no_formulas_and_numbers_stay_numbers(made: Path) -> None:
     head, *rows = csv_words(made / "tables" / "final_reach.csv")
     arms = [row[head.index("arm")] for row in rows]
-    assert {escape.typed(arm) for arm in arms} == set(NAMES)
+    assert {escaping.typed(arm) for arm in arms} == set(NAMES)
     assert "'=1+1" in arms
     assert [cell for row in rows for cell in row if cell[:1] in "=+-@\t\r" and not _number(cell)] == []
     assert all(_number(row[head.index("mean")]) for row in rows)
     curves = csv_words(made / "figures" / "curves_reach.csv")
-    names = {escape.typed(row[curves[0].index("name")]) for row in curves[1:]}
+    names = {escaping.typed(row[curves[0].index("name")]) for row in curves[1:]}
     assert set(NAMES) <= names
 
 
@@ -168,7 +167,7 @@ def test_a_matrix_names_its_rows(tmp_path: Path) -> None:
     assert sorted(text.get_text() for text in axes.get_yticklabels()) == sorted(few)
     save(drawing, tmp_path, "matrix")
     assert "[U+57FA U+7EBF]" in [text.get_text() for text in axes.get_xticklabels()]
-    assert {row[0] for row in csv_words(tmp_path / "matrix.csv")[1:]} == {escape.cell(name) for name in few}
+    assert {row[0] for row in csv_words(tmp_path / "matrix.csv")[1:]} == {escaping.cell(name) for name in few}
 
 
 def test_sweeps_and_transfer_name_their_methods(tmp_path: Path) -> None:
@@ -200,7 +199,7 @@ TYPED = st.text(st.sampled_from(SIGNS), min_size=1, max_size=12).map(str.strip).
 @example("1. x")
 @example("<!-- x --> <b>x</b>")
 def test_markdown_means_what_was_typed(text: str) -> None:
-    marked = escape.markdown(text)
+    marked = escaping.markdown(text)
     for page, words in (
         (f"| a | b |\n|---|---|\n| {marked} | y |\n", f"a\nb\n{text}\ny"),
         (f"- {marked}\n", text),
@@ -209,51 +208,51 @@ def test_markdown_means_what_was_typed(text: str) -> None:
         (f"## {marked}", text),
         (f"*z {marked}.* {marked} `q`", f"z {text}. {text} q"),
         (f"- **{marked}**: z", f"{text}: z"),
-        (f"- {escape.code(text)}", text),
+        (f"- {escaping.code(text)}", text),
     ):
         assert markdown_words(page) == words
-    assert escape.words(f"{marked} `r`") == f"{text} r"
+    assert escaping.words(f"{marked} `r`") == f"{text} r"
 
 
 @given(TYPED)
 def test_latex_means_what_was_typed(text: str) -> None:
     head = "\\midrule\n"
-    assert latex_rows(f"{head}{escape.latex(text)} & y \\\\\n\\bottomrule") == [[text, "y"]]
+    assert latex_rows(f"{head}{escaping.latex(text)} & y \\\\\n\\bottomrule") == [[text, "y"]]
 
 
 @given(st.text(st.sampled_from("'=+-@\t x1"), max_size=5))
 def test_a_cell_of_csv_is_undone(text: str) -> None:
-    assert escape.typed(escape.cell(text)) == text
-    assert not re.match(r"[=+\-@\t\r]", escape.cell(text))
+    assert escaping.typed(escaping.cell(text)) == text
+    assert not re.match(r"[=+\-@\t\r]", escaping.cell(text))
 
 
 def test_what_needs_no_escape_is_left_alone() -> None:
     for text in ("66.1 [64.0, 67.9]", "< 0.001", "+4.6 % [+3.2 %, +5.6 %]", "best_window", "a * b", "70 & 3"):
-        assert escape.markdown(text) == text
+        assert escaping.markdown(text) == text
 
 
 def test_code_in_a_question_stays_code() -> None:
-    assert escape.prose("What does `rhmc <x>` do to a_ *b*?") == r"What does `rhmc <x>` do to a\_ \*b\*?"
-    assert escape.prose("one ` alone") == r"one \` alone"
+    assert escaping.prose("What does `rhmc <x>` do to a_ *b*?") == r"What does `rhmc <x>` do to a\_ \*b\*?"
+    assert escaping.prose("one ` alone") == r"one \` alone"
 
 
 def test_new_lines_end_no_cell_and_no_item() -> None:
-    assert escape.markdown("a\n\n# b\u2028c") == "a # b c"
-    assert escape.latex("a\nb") == "a b"
+    assert escaping.markdown("a\n\n# b\u2028c") == "a # b c"
+    assert escaping.latex("a\nb") == "a b"
 
 
 @settings(deadline=None)
 @given(st.lists(st.text(st.sampled_from("aA-_@. é中"), min_size=1, max_size=8), unique=True, min_size=2, max_size=20))
 def test_no_two_names_share_a_file(names: list[str]) -> None:
-    stems = [escape.stem(name) for name in names]
+    stems = [escaping.stem(name) for name in names]
     assert len({stem.casefold() for stem in stems}) == len(names)
     assert all(re.fullmatch(r"[a-z0-9_@-]+", stem) for stem in stems)
 
 
 def test_plain_names_are_their_own_stems() -> None:
-    for name in ("coverage_letter", "reach@hard", "7e67c370d8f2"):
-        assert escape.stem(name) == name
-    assert escape.stem("reach_arms") != "reach_arms"  # which are the files of the study `reach`
+    for name in ("coverage_paper_faithful", "reach@hard", "7e67c370d8f2"):
+        assert escaping.stem(name) == name
+    assert escaping.stem("reach_arms") != "reach_arms"  # which are the files of the study `reach`
 
 
 @pytest.mark.usefixtures("unpainted")
@@ -268,7 +267,7 @@ def test_studies_whose_names_are_alike_have_files_of_their_own(tmp_path: Path) -
     assert len(list((out / "figures").glob("curves_*.png"))) == 2 * len(names)
     for name in names:
         assert f"Study {name}: learning curves" in page.words
-        assert (out / "tables" / f"final_{escape.stem(name)}.csv").exists()
+        assert (out / "tables" / f"final_{escaping.stem(name)}.csv").exists()
 
 
 # Letters
@@ -276,27 +275,27 @@ def test_studies_whose_names_are_alike_have_files_of_their_own(tmp_path: Path) -
 
 def test_a_letter_in_no_font_is_its_number() -> None:
     font = FontProperties(family=["DejaVu Sans"])
-    assert letters.readable("基线 a", font) == "[U+57FA U+7EBF] a"
-    assert letters.readable("消融", font) == "[U+6D88 U+878D]"
-    assert letters.readable("🐞\u2068\nx", font) == "[U+1F41E]\nx"  # a mark that orders letters is not seen
-    assert letters.readable("שלום αβ − ≥", font) == "שלום αβ − ≥"
+    assert glyphs.readable("基线 a", font) == "[U+57FA U+7EBF] a"
+    assert glyphs.readable("消融", font) == "[U+6D88 U+878D]"
+    assert glyphs.readable("🐞\u2068\nx", font) == "[U+1F41E]\nx"  # a mark that orders letters is not seen
+    assert glyphs.readable("שלום αβ − ≥", font) == "שלום αβ − ≥"
 
 
 def test_a_font_that_has_the_letter_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     family = _font(tmp_path, "基")
-    monkeypatch.setattr(letters, "FALLBACKS", (family,))
-    letters.families.cache_clear()
+    monkeypatch.setattr(glyphs, "FALLBACKS", (family,))
+    glyphs.families.cache_clear()
     try:
         with styled():
             figure = blank(3, 2)
             text = figure.text(0.1, 0.5, "基线")
-        assert letters.settle(figure)
+        assert glyphs.settle(figure)
         assert text.get_text() == "基[U+7EBF]"
         with styled():
             figure.savefig(tmp_path / "x.png")
             figure.savefig(tmp_path / "x.pdf")
     finally:
-        letters.families.cache_clear()
+        glyphs.families.cache_clear()
 
 
 def _font(folder: Path, letter: str) -> str:

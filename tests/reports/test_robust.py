@@ -1,4 +1,4 @@
-"""What is given to a report may be anything, and what is only looked at may fail: one line each, and no half report."""
+"""A report may be given anything, and its figures may fail: one line each, and no half report."""
 
 import json
 import os

@@ -91,7 +91,7 @@ def logged(card: StudyCard, home: Path) -> list[Run]:
 
 def _run(client: Any, one: Any, home: Path) -> Run:
     tags, ref = one.data.tags, one.info.run_id
-    name = "/".join(tags.get(key, "") for key in ("role", "variant", "seed", "spec"))
+    name = "/".join(tags.get(key, "") for key in ("role", "arm", "seed", "spec"))
     history = {}
     for metric in sorted(one.data.metrics):
         values = [
@@ -121,7 +121,7 @@ def _plain(state: Any) -> Any:
 
 
 def faults(found: list[Run], expected: list[Run]) -> dict[str, int]:
-    """How often each thing went wrong that must not: all zero where the study survived."""
+    """Counts of each fault that must not happen: all zero where the study survived."""
     names = [one.name for one in found]
     wanted = {one.name: one for one in expected}
     both = [(one, wanted[one.name]) for one in found if one.name in wanted]
@@ -262,7 +262,7 @@ def settle(log: Path) -> None:
 
 
 def fit_here(jobs: list[dict[str, Any]], recorder: Recorders, *rest: Any) -> None:
-    """What `ray_driver.fit` does, one job after the other in this process."""
+    """The work of `ray_driver.fit`, one job after the other in this process."""
     for job in jobs:
         worker = RunTrainable({"job": job})
         recorder.start(job["key"])
@@ -302,7 +302,7 @@ class Server:
 
     @property
     def alive(self) -> bool:
-        """Whether it serves."""
+        """True if it serves."""
         return self.process is not None and self.process.is_alive()
 
     def kill(self) -> None:

@@ -52,7 +52,7 @@ def kill(leader: int) -> None:
 
 
 def wait_for(ready: Callable[[], Any], what: str) -> Any:
-    """What `ready` gives once it is true; an error of a network or a database counts as no."""
+    """The result of `ready` once it is true; an error of a network or a database counts as no."""
     end = time.monotonic() + PATIENCE
     while time.monotonic() < end:
         with suppress(OSError, psycopg.Error):
@@ -145,7 +145,7 @@ class Node:
         (self.id,) = (word.partition("=")[2] for word in raylet.cmdline() if word.startswith("--node_id="))
 
     def trained(self, place: str) -> bool:
-        """Whether a word of the tag `nodes` means this node."""
+        """True if a word of the tag `nodes` means this node."""
         return place.endswith(f"({self.id[:8]})")
 
     def kill(self) -> None:

@@ -31,8 +31,7 @@ from pipelines.specs.search import Search
 from pipelines.tracking import mlflow_tracker, registry
 from pipelines.tracking.plan import Commit, study_card
 from pipelines.tracking.tracker import StudyCard
-from pipelines.tuning import ray_workers as pool
-from pipelines.tuning import search_run, trials
+from pipelines.tuning import ray_workers, search_run, trials
 from pipelines.tuning.ray_workers import Failed, TrialJob, Worker
 from reports.pages import build
 from tests.pipelines.support import setting, tiny
@@ -60,7 +59,7 @@ SHORTEST = 3  # writes that a fuse lets pass at the most, where a verb has hardl
 
 
 class World(NamedTuple):
-    """What there is before any verb: a finished study, and a bundle of it."""
+    """The state before any verb: a finished study, and a bundle of it."""
 
     home: Path
     bundle: Path
@@ -85,7 +84,7 @@ class Verb(NamedTuple):
 
 
 class End(NamedTuple):
-    """What a verb left."""
+    """The state that a verb left."""
 
     runs: list[Run]
     files: dict[str, bytes]  # below `OUT`
@@ -146,15 +145,15 @@ def in_registration(fuse: Fuse) -> None:
 
 def asked(fuse: Fuse, *, between: bool) -> None:
     """Arm the fuse while a trial is asked for and not told, or while none is."""
-    ledgers: list[trials.Ledger] = []
-    make = trials.Ledger.__init__
+    arm_studies: list[trials.ArmStudy] = []
+    make = trials.ArmStudy.__init__
 
-    def noted(self: trials.Ledger, *args: Any) -> None:
+    def noted(self: trials.ArmStudy, *args: Any) -> None:
         make(self, *args)
-        ledgers.append(self)
+        arm_studies.append(self)
 
-    trials.Ledger.__init__ = noted  # type: ignore[method-assign]
-    fuse.counts = lambda: between == any(one.live for one in ledgers)
+    trials.ArmStudy.__init__ = noted  # type: ignore[method-assign]
+    fuse.counts = lambda: between == any(one.live for one in arm_studies)
 
 
 def asked_for(fuse: Fuse) -> None:
@@ -190,7 +189,7 @@ VERBS = (
 
 
 class PoolHere:
-    """What `Pool` does, one trial at a time in this process."""
+    """The work of `Pool`, one trial at a time in this process."""
 
     def __init__(self, size: int, cpus: int) -> None:
         self.worker, self.key = Worker(), ""
@@ -229,7 +228,7 @@ def _act(number: int, home: str, packed: str, length: int, count: str) -> None:
         module.read_commit = lambda: Commit("c0ffee")  # type: ignore[attr-defined]  # the code may be worked on meanwhile
     ray_driver.ray_session = lambda *args: nullcontext([])  # type: ignore[assignment,return-value]
     ray_driver.fit = fit_here  # type: ignore[assignment]
-    pool.Pool = PoolHere  # type: ignore[assignment,misc]
+    ray_workers.Pool = PoolHere  # type: ignore[assignment,misc]
     fuse = Fuse(length)
     VERBS[number].between(fuse)
     fuse.lay(home)
@@ -275,12 +274,12 @@ def fresh(folder: Path, verb: Verb, world: World) -> Path:
 
 
 def log(home: Path) -> str:
-    """What the processes said."""
+    """The output of the processes."""
     return Path(f"{home}.log").read_text(encoding="utf-8")
 
 
 def end_of(verb: Verb, home: Path) -> End:
-    """What a verb left in a folder."""
+    """The files that a verb left in a folder."""
     runs = logged(verb.logs(home), home) if verb.logs else []
     files = {str(path.relative_to(home)): path for path in sorted(home.rglob("*")) if path.is_file()}
     written = {name: path.read_bytes() for name, path in files.items() if name.startswith(f"{OUT}/")}
@@ -290,7 +289,7 @@ def end_of(verb: Verb, home: Path) -> End:
 
 
 def wrong(found: End, wanted: End) -> Counter[str]:
-    """How often each thing went wrong."""
+    """Counts of each fault."""
     counts = faults(found.runs, wanted.runs)
     names = found.files.keys() | wanted.files.keys()
     left = found.names - wanted.names
@@ -311,7 +310,7 @@ WRONG = tuple(wrong(End([], {}, Counter()), End([], {}, Counter())))
 
 
 class Disturbed(NamedTuple):
-    """What came of a verb."""
+    """The outcome of a verb."""
 
     kills: int
     starts: int

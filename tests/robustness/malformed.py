@@ -100,7 +100,7 @@ class Case(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What came of a command."""
+    """The outcome of a command."""
 
     code: int | None  # None: it hung
     said: str
@@ -269,7 +269,7 @@ def searches() -> Iterator[Case]:
 
 
 def includes() -> Iterator[Case]:
-    """What a study includes."""
+    """The files that a study includes."""
     study = at(GOOD, "arms.IQL", {"algo": {"include": "inc.yaml"}})
 
     def of(name: str, make: Callable[[Path, Path], None], *says: str | tuple[str, ...]) -> Case:
@@ -311,7 +311,7 @@ def options() -> Iterator[Case]:
         ("an arm", "evaluate s.yaml --arm none", "--arm", "IQL"),
         ("a seed of 2^64", "evaluate s.yaml --seed 18446744073709551616", "seed"),
         ("episodes 10^18", "evaluate s.yaml --episodes 1000000000000000000", "episodes"),
-        ("a bank of 2^64", "evaluate s.yaml --bank 18446744073709551616", "bank"),
+        ("an eval seed of 2^64", "evaluate s.yaml --eval-seed 18446744073709551616", "eval-seed"),
         ("transfer to x", "transfer s.yaml --agents x --out o", "--agents"),
         ("transfer to 10^30", f"transfer s.yaml --agents {10**30} --out o", "--agents"),
         ("a port", "ui --port 70000", "port"),
@@ -331,7 +331,7 @@ def options() -> Iterator[Case]:
 
 
 def paths() -> Iterator[Case]:
-    """What verbs are given to read or write, and is no file."""
+    """Paths that verbs are given to read or write, and that are no files."""
     verbs = (
         "study check {}", "study status {}", "search check {}", "evaluate {}", "study import {}", "report --study {}",
         "render {} --out x.gif", "study export {} x.zip", "evaluate p.pt --config {}", "fingerprint {}",
@@ -400,7 +400,7 @@ def environments() -> Iterator[Case]:
 
 
 def bundles(rng: random.Random) -> Iterator[Case]:
-    """What `study import` has to refuse. Nothing of one may be taken in."""
+    """Bundles that `study import` has to refuse. Nothing of one may be taken in."""
 
     def of(
         name: str, change: Callable[[Path], None], *says: str | tuple[str, ...], codes: tuple[int, ...] = ()
@@ -504,7 +504,7 @@ def text_in(name: str, content: bytes) -> Callable[[Path], None]:
 
 
 def tables(rng: random.Random) -> Iterator[Case]:
-    """What `rhmc report` has to refuse: tables of another type or schema, and files beside them."""
+    """Input that `rhmc report` has to refuse: tables of another type or schema, and files beside them."""
 
     def of(
         name: str, change: Callable[[Path], None], *says: str | tuple[str, ...], codes: tuple[int, ...] = ()
@@ -570,7 +570,7 @@ def copied(source: Path, target: Path) -> None:
 
 
 def paper(content: str) -> Callable[[Path, Path], None]:
-    """What the paper states, which the process that runs the case reads in place of the package's own."""
+    """The paper's statements, which the process that runs the case reads in place of the package's own."""
 
     def make(folder: Path, base: Path) -> None:
         shutil.copytree(base / "tables", folder / "t")
@@ -732,7 +732,7 @@ class Runner:
 
 
 def judge(case: Case, outcome: Outcome, before: dict[str, bytes], after: dict[str, bytes]) -> dict[str, str]:
-    """What is wrong with an outcome, by `WRONG`."""
+    """The faults of an outcome, by `WRONG`."""
     found = {}
     if outcome.trace:
         found["tracebacks"] = outcome.trace.strip().splitlines()[-1]

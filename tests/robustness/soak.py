@@ -93,7 +93,7 @@ class Campaign:
                     process.kill()
 
     def _left(self) -> list[psutil.Process]:
-        """What the drivers started and is still there after a minute."""
+        """The processes that drivers started and that are still there after a minute."""
         for _ in range(120):
             left = [process for pid in self.drivers for process in started_by(pid)]
             if not left:
@@ -147,7 +147,7 @@ class Campaign:
             driver.wait(self.rng.uniform(0.1, LONGEST) * (1 if self.rng.random() < 0.5 else 3))
 
     def _kill(self, driver: subprocess.Popen[bytes], kind: str) -> bool:
-        """Whether there was something to kill."""
+        """True if there was something to kill."""
         if kind == "server":
             if self.server is None:
                 return False
@@ -171,7 +171,7 @@ class Campaign:
 
 
 def result(home: Path, uri: str, points: int) -> tuple[list[Run], bytes]:
-    """What the log holds at the end, and the exported values."""
+    """The content of the log at the end, and the exported values."""
     os.environ["MLFLOW_TRACKING_URI"] = uri
     plan = study(points)
     tracker = open_existing(study_card(plan), Home(home))
@@ -180,7 +180,7 @@ def result(home: Path, uri: str, points: int) -> tuple[list[Run], bytes]:
 
 
 def soak(folder: Path, kills: int, seed: int, points: int) -> tuple[Counter[str], dict[str, int]]:
-    """What was done, and what went wrong in all."""
+    """The totals of actions and faults."""
     rng, kills_left, number = random.Random(seed), kills, 0
     done: Counter[str] = Counter()
     wrong: Counter[str] = Counter()

@@ -222,7 +222,7 @@ class Listener:
 
 
 def lives(deaths: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What a recorder is told while workers die, W, or their node, N, or get further, -, as Tune has it."""
+    """The events that a recorder is told while workers die, W, or their node, N, or get further, -, as Tune has it."""
     monkeypatch.setattr(cluster, "alive", dict)
     listener = Listener()
     bridge = Bridge(listener, folder / "stop")  # type: ignore[arg-type]
@@ -268,7 +268,7 @@ def test_dead_nodes_cost_no_attempt(deaths: str, end: str, tmp_path: Path, monke
 
 
 class Site(NamedTuple):
-    """What past one machine is there."""
+    """The addresses of a cluster of several machines."""
 
     database: str  # address without a name
     uri: str  # MLflow
@@ -308,7 +308,7 @@ class Launch:
         self.process, self.log = process, log
 
     def said(self) -> str:
-        """What it has said so far. It must not have ended with another exit code than 0."""
+        """The output so far. It must not have ended with another exit code than 0."""
         assert self.process.poll() in (None, 0), self.log.read_text()
         return self.log.read_text()
 
@@ -418,10 +418,10 @@ def test_a_search_in_postgresql_is_killed_and_goes_on_with_more_trials(
         wait_for(lambda: launched.said() and list(tmp_path.glob("checkpoints/*/0*.pt")), "a trial under way")
     more = Search.load("search_x.yaml", overrides=["trials=3"])
     assert show_search(more, tmp_path) == 1
-    with driver([*command, "--set", "trials=3", "--out", "found"], at_site, tmp_path) as launched:
+    with driver([*command, "--set", "trials=3", "--out", "best_params"], at_site, tmp_path) as launched:
         out = launched.end()
     assert "IQL: 0 of 3 trials are done, 1 are taken up" in out
-    assert (tmp_path / "found" / "search_x.iql.quick.yaml").exists()
+    assert (tmp_path / "best_params" / "search_x.iql.quick.yaml").exists()
     assert not (tmp_path / "optuna.db").exists()
     assert show_search(more, tmp_path) == 0
     tracker = open_existing(search_card(more), Home(tmp_path))

@@ -25,7 +25,7 @@ NOTHING_WRONG = dict.fromkeys(faults([], []), 0)
 
 
 class Whole:
-    """What a launch that nobody disturbed leaves."""
+    """The state that an undisturbed launch leaves."""
 
     def __init__(self, home: Path) -> None:
         assert launch(STUDY, home) == 0, (home / "driver.log").read_text()

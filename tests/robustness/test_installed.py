@@ -48,7 +48,7 @@ def user(tmp_path: Path) -> Path:
 
 
 def rhmc(site: Path, user: Path, *words: str) -> str:
-    """What the installed command prints, in the person's folder and with it on the search path; it must succeed."""
+    """The output of the installed command, in the person's folder and with it on the search path; it must succeed."""
     environment = {"PYTHONPATH": f"{user}{os.pathsep}{site}", "RHMC_HOME": str(user / "work")}
     done = subprocess.run(
         [sys.executable, "-W", "ignore", str(site / "bin" / "rhmc"), *words],

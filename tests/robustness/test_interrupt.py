@@ -57,7 +57,7 @@ def driver(home: Path, concurrent: int) -> subprocess.Popen[str]:
 
 
 def all_end(driver: int, name: str = "") -> bool:
-    """Whether nothing that a driver started, with `name` in its command line, is left within a minute."""
+    """True if nothing that a driver started, with `name` in its command line, is left within a minute."""
     for _ in range(600):
         if not started_by(driver, name):
             return True
@@ -114,7 +114,7 @@ def test_an_interrupted_launch(
 
 
 def run_with_ray(study: Study, home: Path) -> int:
-    """What `rhmc study run` does, in this process."""
+    """The work of `rhmc study run`, in this process."""
     return run_studies([study], home)
 
 

@@ -103,7 +103,7 @@ def test_names_that_need_no_change_are_kept() -> None:
 
 def test_winners_that_are_committed_keep_their_names() -> None:
     search = Search.load(ROOT / "studies/search_rhmc.yaml")
-    there = {file.name for file in (ROOT / "studies/found").glob("*.quick.yaml")}
+    there = {file.name for file in (ROOT / "studies/best_params").glob("*.quick.yaml")}
     assert there
     assert there <= {file_name(search, arm) for arm in search.arms}
 
@@ -159,7 +159,7 @@ def test_arms_that_look_alike_are_refused(one: str, other: str) -> None:
 
 
 def test_variants_that_look_alike_are_refused() -> None:
-    more = "variants: {letter: {algo: {lr: 0.1}}, Letter: {algo: {lr: 0.2}}}\n"
+    more = "variants: {paper_faithful: {algo: {lr: 0.1}}, Letter: {algo: {lr: 0.2}}}\n"
     (said,) = faults(written(["a"], more=more))
     assert "'Letter' differs from variant 'letter' in case" in said
 
@@ -206,7 +206,7 @@ def tables_in(file: Path) -> set[str]:
         ("b" * 81, f"a name of 81 bytes; at most {STUDY}, for it is part of other names"),
         ("基" * 30, f"a name of 90 bytes; at most {STUDY}, for it is part of other names"),
         ("x_arms", "a study's name does not end in '_arms', as a figure of the study 'x' does"),
-        ("x@letter", "a study's file is named with letters, digits, '-' and '_' only"),
+        ("x@paper_faithful", "a study's file is named with letters, digits, '-' and '_' only"),
         ("a b", "a study's file is named with letters, digits, '-' and '_' only"),
         ("-x", "a study's file is named with no '-' in front, which would make it an option"),
     ],

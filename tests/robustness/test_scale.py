@@ -1,4 +1,4 @@
-"""What a study of thousands of runs must not do again for each of them. Calls are counted, nothing is timed."""
+"""Work that a study of thousands of runs must not repeat for each of them. Calls are counted, nothing is timed."""
 
 import io
 import sqlite3

@@ -27,7 +27,7 @@ from pipelines.export import yardsticks
 from pipelines.specs.identity import fingerprint
 from pipelines.workspace.process_pool import KILLED
 from pipelines.workspace.provenance import host
-from rhmc.scripted.yardsticks import names
+from rhmc.yardsticks.scores import names
 from tests.pipelines.support import jobs_of
 from tests.robustness.fleet import wait_for
 
@@ -206,10 +206,10 @@ def test_list_leaves_searches_out(rhmc: Rhmc) -> None:
 
 def test_list_for_scripts(rhmc: Rhmc) -> None:
     Path("studies/bad.yaml").write_text("a: [")
-    Path("studies/two.yaml").write_text(STUDY + "variants: {letter: {algo: {encoder: mlp}}}\n")
+    Path("studies/two.yaml").write_text(STUDY + "variants: {paper_faithful: {algo: {encoder: mlp}}}\n")
     bad, two, plain = json.loads(rhmc("study", "list", "--json").out)
     assert (bad["study"], bad["question"], "not YAML" in bad["fault"]) == ("studies/bad.yaml", "", True)
-    assert (two["variants"], plain["variants"], plain["fault"]) == (["letter"], [], "")
+    assert (two["variants"], plain["variants"], plain["fault"]) == (["paper_faithful"], [], "")
 
 
 def test_status_for_scripts(rhmc: Rhmc) -> None:
@@ -217,7 +217,15 @@ def test_status_for_scripts(rhmc: Rhmc) -> None:
     none = {"planned": 2, "finished": 0, "running": 0, "interrupted": 0, "failed": 0, "missing": 2, "stale": 0}
     assert (said.code, said.err) == (1, "")
     arms = {"full": none, "none": none}
-    expected = {"study": "x", "profile": "quick", "finished": False, "arms": arms, "errors": {}, "stale": []}
+    expected = {
+        "study": "x",
+        "profile": "quick",
+        "finished": False,
+        "arms": arms,
+        "errors": {},
+        "stale": [],
+        "remarks": [],
+    }
     assert json.loads(said.out) == expected
 
 
@@ -467,7 +475,7 @@ def test_an_export_without_a_return_is_left_out(rhmc: Rhmc) -> None:
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Banks that take a second: few episodes, and three of the tasks."""
+    """Evaluations that take a second: few episodes, and three of the tasks."""
     tasks = [yardsticks.TASKS[n] for n in (1, 5, -1)]
     monkeypatch.setattr("pipelines.export.yardsticks.EPISODES", {"quick": yardsticks.Episodes(4, 2)})
     monkeypatch.setattr("pipelines.export.yardsticks.TASKS", tuple(tasks))
@@ -489,7 +497,7 @@ def test_all_yardsticks_are_the_same_whatever_is_played_at_a_time(
         assert Path("one", name).read_bytes() == Path("two", name).read_bytes()
 
 
-def test_all_yardsticks_are_those_that_a_bank_at_a_time_gives(rhmc: Rhmc, small: None) -> None:
+def test_all_yardsticks_are_those_that_an_evaluation_at_a_time_gives(rhmc: Rhmc, small: None) -> None:
     said = rhmc("yardsticks", "all", "--out", "o")
     lines = [line.split() for line in said.out.splitlines() if line.strip() and "─" not in line]
     assert lines[0] == ["task", "policy", "coverage", "or", "return", "sem"]
@@ -539,12 +547,16 @@ def test_all_yardsticks_are_all(profile: str, rhmc: Rhmc, monkeypatch: pytest.Mo
         played.append((env, tuple(chosen), episodes, seed))
         return {}
 
-    monkeypatch.setattr("rhmc.scripted.yardsticks.yardsticks", play)
+    monkeypatch.setattr("rhmc.yardsticks.scores.play_yardsticks", play)
     for words in by_hand(profile):
         assert rhmc("yardsticks", *words).code == 0
-    found = yardsticks.banks(profile)
-    assert sorted(map(repr, played)) == sorted(repr(tuple(bank)) for bank in found)
-    assert [(bank.env.preset, "planner" in bank.policies) for bank in found[:3] if bank.env.kind == "coverage"] == [
+    found = yardsticks.evaluations(profile)
+    assert sorted(map(repr, played)) == sorted(repr(tuple(evaluation)) for evaluation in found)
+    assert [
+        (evaluation.env.preset, "planner" in evaluation.policies)
+        for evaluation in found[:3]
+        if evaluation.env.kind == "coverage"
+    ] == [
         ("coordinator", True),
         ("coordinator", False),
         ("flat", True),
@@ -562,7 +574,7 @@ def test_all_yardsticks_are_all(profile: str, rhmc: Rhmc, monkeypatch: pytest.Mo
 def test_all_yardsticks_are_not_played_for_nothing(
     words: list[str], said: str, rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipelines.export.yardsticks.score_banks", None)
+    monkeypatch.setattr("pipelines.export.yardsticks.evaluate_all", None)
     Path("o").mkdir()
     pd.DataFrame({"a": [1]}).to_parquet("o/yardsticks.parquet")
     assert rhmc("yardsticks", "all", *words) == (2, "", said + "\n")
@@ -575,8 +587,8 @@ def test_a_worker_that_is_killed_writes_nothing(rhmc: Rhmc, monkeypatch: pytest.
     assert not Path("o").exists()
 
 
-def die(bank: yardsticks.Bank) -> None:
-    """What a lack of memory does to a worker."""
+def die(evaluation: yardsticks.Evaluation) -> None:
+    """The effect of a lack of memory on a worker."""
     os.kill(os.getpid(), signal.SIGKILL)
 
 

@@ -1,4 +1,4 @@
-"""What the doctor says of installations that are well and of those that are not."""
+"""The doctor's findings on installations that are well and of those that are not."""
 
 import sys
 from contextlib import nullcontext
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
-from pipelines.cli import checks as doctor
+from pipelines.cli import checks
 from pipelines.cli.checks import (
     Finding,
     arithmetic,
@@ -43,7 +43,7 @@ def test_libraries_against_the_lock(monkeypatch: pytest.MonkeyPatch, tmp_path: P
     assert found.text.startswith("no-such-library missing instead of 1.0, torch 2")
     assert found.text.endswith(" and 1 more: make setup")
     assert libraries([])[0] == Finding("ok", "libraries", "all 0 as required")
-    monkeypatch.setattr(doctor, "LOCK", tmp_path / "no lock")  # installed from a wheel
+    monkeypatch.setattr(checks, "LOCK", tmp_path / "no lock")  # installed from a wheel
     assert {"torch", "ray"} <= {one.name for one in required()}
     assert not {"pytest", "psycopg"} & {one.name for one in required()}
     assert libraries()[0].level == "ok"
@@ -123,9 +123,9 @@ def test_a_ray_that_strangers_reach_is_a_fault(fence: tuple[str, bool], monkeypa
 
 
 def test_an_examination_goes_on_after_a_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "NEEDED", 2**70)
-    monkeypatch.setattr(doctor, "LOCK", tmp_path / "none")
-    monkeypatch.setattr(doctor, "requires", lambda name: ["torch==0.1", 'x==1; extra == "test"'])
+    monkeypatch.setattr(checks, "NEEDED", 2**70)
+    monkeypatch.setattr(checks, "LOCK", tmp_path / "none")
+    monkeypatch.setattr(checks, "requires", lambda name: ["torch==0.1", 'x==1; extra == "test"'])
     found = list(examine(tmp_path, ray=False))
     assert [one.what for one in found] == ["python", "libraries", "torch", "arithmetic", "code", "work folder", "store"]
     assert found[1].level == "fault"

@@ -28,11 +28,6 @@ SECOND = tiny("second", arms={"as slow": setting(lr=1e-4), "faster": setting(lr=
 
 
 @pytest.fixture
-def shelf() -> list[MemoryRun]:
-    return []
-
-
-@pytest.fixture
 def both(shelf: list[MemoryRun], tmp_path: Path) -> Recorders:
     board = PlainBoard(Console(file=io.StringIO(), width=200))
 

@@ -1,4 +1,4 @@
-"""Who else can do what with a launch: strangers who know address and port, and other users of the same machine."""
+"""Access of others to a launch: strangers who know address and port, and other users of the same machine."""
 
 import errno
 import http.client
@@ -77,7 +77,7 @@ def session(cluster: None) -> Iterator[list[psutil.Process]]:
 
 
 def of_each(processes: list[psutil.Process], look: Callable[[psutil.Process], Any]) -> list[Any]:
-    """What a look at each process finds; an idle worker may be gone by now."""
+    """The result of a look at each process; an idle worker may be gone by now."""
     found = []
     for process in processes:
         with suppress(psutil.NoSuchProcess):

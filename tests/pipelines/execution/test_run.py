@@ -48,11 +48,6 @@ STUDIES = Path(__file__).parents[3] / "studies"
 
 
 @pytest.fixture
-def shelf() -> list[MemoryRun]:
-    return []
-
-
-@pytest.fixture
 def launch(shelf: list[MemoryRun], tmp_path: Path) -> Launch:
     """A recorder as a new launch makes it."""
 
@@ -64,7 +59,7 @@ def launch(shelf: list[MemoryRun], tmp_path: Path) -> Launch:
 
 
 def finish(recorder: Recorder, key: str) -> None:
-    """What a worker does at its end."""
+    """The actions of a worker at its end."""
     folder = recorder.home.checkpoints(key)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "policy.pt").write_bytes(b"weights")
@@ -409,7 +404,7 @@ def test_a_run_that_diverges_looks_failed_everywhere(
     assert line in capsys.readouterr().out.splitlines()
 
 
-# What may be in the way
+# Environment errors
 
 
 def test_a_second_driver_is_refused(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -715,8 +710,8 @@ def test_a_setting_that_one_method_lacks_does_not_vary_for_that() -> None:
 
 
 def test_the_next_command_names_the_variant() -> None:
-    study = Study.load(STUDIES / "ablation.yaml", "quick", ["seeds=1"], "letter")
-    assert _arguments([study]) == f"{STUDIES / 'ablation.yaml'} --profile quick --variant letter --set seeds=1"
+    study = Study.load(STUDIES / "ablation.yaml", "quick", ["seeds=1"], "paper_faithful")
+    assert _arguments([study]) == f"{STUDIES / 'ablation.yaml'} --profile quick --variant paper_faithful --set seeds=1"
 
 
 def test_the_next_command_names_the_file_and_the_changes() -> None:

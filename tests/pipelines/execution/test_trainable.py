@@ -20,7 +20,7 @@ from pipelines.execution.cluster import here
 from pipelines.execution.finite import DivergedError, check, defined
 from pipelines.execution.seed_group import Seeds
 from pipelines.execution.trainable import RunTrainable
-from pipelines.workspace import work_folder as store
+from pipelines.workspace import work_folder
 from pipelines.workspace.work_folder import (
     Checkpoints,
     DamagedError,
@@ -62,12 +62,12 @@ def finish(run: RunTrainable) -> list[dict[str, Any]]:
 
 
 def points(results: list[dict[str, Any]]) -> list[dict[str, float]]:
-    """What training gave, clocks aside."""
+    """The values of training, clocks aside."""
     return [{k: v for k, v in p.items() if not k.startswith("time/")} for r in results for p in r["points"]]
 
 
 def same(a: Any, b: Any) -> bool:
-    """Whether two states are equal, bit for bit."""
+    """True if two states are equal, bit for bit."""
     if isinstance(a, torch.Tensor):
         return a.dtype == b.dtype and torch.equal(a, b)
     if isinstance(a, dict):
@@ -137,7 +137,7 @@ class Broken(io.BufferedReader):
 
 
 def system(code: int) -> Callable[..., Any]:
-    """What the system refuses."""
+    """Errors that the system raises."""
 
     def refuse(*args: Any, **options: Any) -> Any:
         raise OSError(code, os.strerror(code))
@@ -146,7 +146,7 @@ def system(code: int) -> Callable[..., Any]:
 
 
 def lack(error: Exception) -> Callable[..., Any]:
-    """What torch or zipfile raise."""
+    """Errors that torch or zipfile raise."""
 
     def refuse(*args: Any, **options: Any) -> Any:
         raise error
@@ -403,7 +403,7 @@ def test_what_has_no_value_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_file_is_durable_before_its_name_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[tuple[str, bool]] = []
-    monkeypatch.setattr(store, "sync", lambda path: seen.append((path.name, (tmp_path / "x.pt").exists())))
+    monkeypatch.setattr(work_folder, "sync", lambda path: seen.append((path.name, (tmp_path / "x.pt").exists())))
     save_atomically(tmp_path / "x.pt", 1)
     assert [(name.split(".")[-1], there) for name, there in seen] == [("part", False), (tmp_path.name, True)]
 
@@ -557,4 +557,4 @@ def test_no_checkpoint_is_no_state(tmp_path: Path) -> None:
     ],
 )
 def test_an_error_in_one_line(text: str, line: str) -> None:
-    assert store.one_line(ValueError(text)) == line
+    assert work_folder.one_line(ValueError(text)) == line

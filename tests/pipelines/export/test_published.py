@@ -1,15 +1,18 @@
 """Results here against published ones, from the command line."""
 
+import shutil
 from pathlib import Path
 from typing import NamedTuple
 
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
 from pipelines.cli.main import app
 from pipelines.export.published import folder, publish, retrain
-from pipelines.export.tables import write_tables
+from pipelines.export.tables import VERSION, write_tables
 from pipelines.specs.study import Study
 from pipelines.tracking.plan import items, study_card
 from pipelines.tracking.tracker import MemoryTracker
@@ -123,6 +126,15 @@ def test_a_missing_seed_other_settings_and_another_profile(exported: Path, tmp_p
     assert verify("--profile", "paper", "--runs", exported).code == 2
 
 
+def test_published_tables_of_an_older_version_are_not_compared(exported: Path, tmp_path: Path) -> None:
+    shutil.copytree(exported, tmp_path / "old")
+    file = tmp_path / "old" / "tiny.runs.parquet"
+    pd.read_parquet(file).to_parquet(file)
+    said = verify("--published", tmp_path / "old", "--runs", exported)
+    remedy = "`rhmc study run` and `rhmc export` make them anew, `rhmc verify --publish` publishes them"
+    assert said == (2, f"{tmp_path / 'old'}: tables of an older version, which are not compared; {remedy}")
+
+
 def test_yardsticks_among_the_published_results_are_not_looked_for_in_a_log(
     exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -132,8 +144,9 @@ def test_yardsticks_among_the_published_results_are_not_looked_for_in_a_log(
         (with_yardsticks / file.name).write_bytes(file.read_bytes())
         table = pd.read_parquet(file).assign(study="yardsticks")
         if "algorithm" in table:
-            table["algorithm"] = "scripted"
-        table.to_parquet(with_yardsticks / file.name.replace("tiny", "yardsticks"))
+            table["algorithm"] = "yardstick"
+        changed = pa.Table.from_pandas(table, preserve_index=False).replace_schema_metadata(VERSION)
+        pq.write_table(changed, with_yardsticks / file.name.replace("tiny", "yardsticks"))
     said = verify("--published", with_yardsticks, "--runs", with_yardsticks)
     assert said == (0, "byte-equal to the published quick results: 4 arms\n")
     again = verify("--published", with_yardsticks, "--retrain", "9", "--jobs", "1")

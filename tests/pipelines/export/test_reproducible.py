@@ -1,4 +1,4 @@
-"""What the pipeline declares is the same bytes wherever results are equal, and `make repro` ends by saying so."""
+"""Declared outputs are the same bytes wherever results are equal, and the last line of `make repro` says so."""
 
 import os
 import shutil
@@ -12,7 +12,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from pipelines.export.tables import MADE, METRICS, PLACE, RUNS, write_tables
-from pipelines.export.yardsticks import Bank, Scored, export_yardsticks
+from pipelines.export.yardsticks import Evaluation, Scored, export_yardsticks
 from pipelines.policies.transfer import TRANSFER
 from pipelines.tracking.plan import items, study_card
 from pipelines.tracking.tracker import MemoryTracker
@@ -38,7 +38,7 @@ def deps(stage: str) -> set[str]:
 
 
 class World(NamedTuple):
-    """Where and when the same results are made."""
+    """The place and time where the same results are made."""
 
     commit: str
     host: Host
@@ -66,9 +66,9 @@ def make(folder: Path, world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     write_tables(study, items(study), tracker, runs)
     monkeypatch.setattr("pipelines.export.yardsticks.commit", lambda: world.commit)
     monkeypatch.setattr("pipelines.export.yardsticks.host", lambda: world.host)
-    bank = Bank(coverage.Config(agents=2, targets=2), ("best_window",), 4)
+    evaluation = Evaluation(coverage.Config(agents=2, targets=2), ("best_window",), 4)
     score = {"coverage": 40.0, "return": 40.0, "sem": 0.5}
-    export_yardsticks([Scored(bank, {"best_window": score})], "quick", runs)
+    export_yardsticks([Scored(evaluation, {"best_window": score})], "quick", runs)
     assert build.build(runs, folder, "quick").undrawn == []
 
 

@@ -23,11 +23,6 @@ POINTS = [
 
 
 @pytest.fixture
-def shelf() -> list[MemoryRun]:
-    return []
-
-
-@pytest.fixture
 def tracker(shelf: list[MemoryRun]) -> MemoryTracker:
     return MemoryTracker(study_card(tiny()), shelf)
 
@@ -45,7 +40,7 @@ def read(folder: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
 
 
 def made(folder: Path) -> pd.DataFrame:
-    """How the runs were made, by arm."""
+    """The provenance of the runs, by arm."""
     return pd.read_parquet(folder / "tiny.made.parquet").set_index("arm")
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.policies.evaluation import Bank, Policy, of_file, of_study, score
+from pipelines.policies.evaluation import EvaluationEpisodes, Policy, of_file, of_study, score
 from pipelines.specs.study import RunSpec, Study
 from pipelines.tracking.mlflow_tracker import MlflowTracker
 from pipelines.tracking.plan import items, resolved_yaml, study_card
@@ -47,17 +47,17 @@ def policy(tmp_path: Path) -> tuple[Path, Metrics]:
 
 def test_a_kept_policy_scores_what_its_run_ended_with(policy: tuple[Path, Metrics]) -> None:
     file, last = policy
-    found = score(of_file(file, None), Bank())
+    found = score(of_file(file, None), EvaluationEpisodes())
     assert found.values == final(last)
     assert (found.arm, found.seed, found.source, found.episodes) == ("slow", 0, "finished", 8)
     assert found.values["return_sem"] > 0
 
 
-def test_another_bank_is_another_score_and_more_episodes_a_smaller_error(policy: tuple[Path, Metrics]) -> None:
+def test_other_episodes_are_another_score_and_more_episodes_a_smaller_error(policy: tuple[Path, Metrics]) -> None:
     file, last = policy
-    other = score(of_file(file, None), Bank(seed=7)).values
+    other = score(of_file(file, None), EvaluationEpisodes(seed=7)).values
     assert other["return"] != last["final/return"]
-    assert score(of_file(file, None), Bank(episodes=200)).values["return_sem"] < other["return_sem"]
+    assert score(of_file(file, None), EvaluationEpisodes(episodes=200)).values["return_sem"] < other["return_sem"]
 
 
 @pytest.mark.parametrize("kind", ALGORITHMS)
@@ -66,25 +66,29 @@ def test_every_method_acts_with_other_numbers_on_the_pairwise_encoder_only(kind:
         one = of_kind(kind, encoder)
         trainer, last = trained(one)
         policy = Policy("a", Saved(one, without_replay(trainer.state_dict())["algorithm"]))
-        assert score(policy, Bank()).values == final(last)
+        assert score(policy, EvaluationEpisodes()).values == final(last)
         if encoder == "pairwise":
-            found = [score(policy, Bank(agents=n, targets=m)).values["return"] for n, m in ((3, 4), (5, 2))]
+            found = [
+                score(policy, EvaluationEpisodes(agents=n, targets=m)).values["return"] for n, m in ((3, 4), (5, 2))
+            ]
             assert len({last["final/return"], *found}) == 3
         else:
             with pytest.raises(InputError, match="acts only with the numbers that it was trained with"):
-                score(policy, Bank(agents=3, targets=4))
+                score(policy, EvaluationEpisodes(agents=3, targets=4))
 
 
 @pytest.mark.parametrize(
-    ("bank", "said"),
+    ("wanted", "said"),
     [
-        (Bank(agents=9), "--agents: 9 sensors need as many boxes, and there are 6"),
-        (Bank(targets=0), "--targets: 0 is not allowed; must be greater than or equal to 1"),
+        (EvaluationEpisodes(agents=9), "--agents: 9 sensors need as many boxes, and there are 6"),
+        (EvaluationEpisodes(targets=0), "--targets: 0 is not allowed; must be greater than or equal to 1"),
     ],
 )
-def test_a_task_that_cannot_be_is_named_by_its_option(policy: tuple[Path, Metrics], bank: Bank, said: str) -> None:
+def test_a_task_that_cannot_be_is_named_by_its_option(
+    policy: tuple[Path, Metrics], wanted: EvaluationEpisodes, said: str
+) -> None:
     with pytest.raises(InputError) as error:
-        score(of_file(policy[0], None), bank)
+        score(of_file(policy[0], None), wanted)
     assert str(error.value) == said
 
 
@@ -106,7 +110,7 @@ def test_a_study_gives_the_policies_of_its_runs(home: Path, tmp_path: Path, monk
 
     found = list(of_study(study, home))
     assert [(one.arm, one.saved.reached) for one in found] == [("done", "finished"), ("half", "at step 200")]
-    assert score(found[0], Bank()).values == final(last)
+    assert score(found[0], EvaluationEpisodes()).values == final(last)
     assert [one.arm for one in of_study(study, home, ["half"])] == ["half"]
     for given, said in [
         ((["hal"], []), r"--arm: 'hal' is not allowed; allowed: done, half, none; did you mean 'half'\?"),
@@ -152,7 +156,7 @@ def test_a_policy_that_names_its_run_needs_no_config_and_takes_its_arm_from_one(
     save(tmp_path / "alone.pt", load(file))
     (tmp_path / "sub").mkdir()
     shutil.copy(tmp_path / "alone.pt", tmp_path / "sub")
-    found = score(of_file(tmp_path / "sub" / "alone.pt", None), Bank())
+    found = score(of_file(tmp_path / "sub" / "alone.pt", None), EvaluationEpisodes())
     assert (found.arm, found.source, found.values) == ("iql", "finished", final(last))
     assert of_file(tmp_path / "alone.pt", None).arm == "slow"
     (tmp_path / "config.yaml").write_text((tmp_path / "config.yaml").read_text().replace("seed: 0", "seed: 7"))
@@ -164,7 +168,7 @@ def test_a_state_of_other_code_is_one_line(policy: tuple[Path, Metrics]) -> None
     file, _ = policy
     saved = load(file)
     with pytest.raises(InputError, match=r"^slow s0: no state of 'iql' as this code has it \("):
-        score(Policy("slow", saved._replace(algorithm=saved.algorithm | {"q": {}})), Bank())
+        score(Policy("slow", saved._replace(algorithm=saved.algorithm | {"q": {}})), EvaluationEpisodes())
 
 
 def test_files_that_are_no_policy(policy: tuple[Path, Metrics], tmp_path: Path) -> None:

@@ -19,9 +19,9 @@ from pipelines.tracking.policy import Actor, Saved
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.work_folder import Home
 from rhmc.envs import coverage, navigation
-from rhmc.scripted import BOUNDS
 from rhmc.training.evaluation import evaluate
 from rhmc.training.trainer import Trainer
+from rhmc.yardsticks import BOUNDS
 from tests.pipelines.execution.test_trainable import finish, job, same
 from tests.pipelines.tracking.test_policy import run
 
@@ -50,18 +50,18 @@ def test_the_episode_is_the_one_that_evaluation_plays(env: dict[str, object]) ->
 
 def test_two_policies_meet_the_same_targets() -> None:
     env = coverage.Config(agents=2, targets=3)
-    one, other = (render.play(env, render.scripted(env, name, 3), 3) for name in ("random", "best_window"))
+    one, other = (render.play(env, render.yardstick(env, name, 3), 3) for name in ("random", "best_window"))
     assert all(torch.equal(a.state.targets, b.state.targets) for a, b in zip(one, other, strict=True))
     assert torch.equal(one[0].state.heading, other[0].state.heading)
     assert not torch.equal(one[-1].state.heading, other[-1].state.heading)
-    third = render.play(env, render.scripted(env, "best_window", 4), 4)
+    third = render.play(env, render.yardstick(env, "best_window", 4), 4)
     assert not torch.equal(third[0].state.targets, other[0].state.targets)
 
 
 def test_any_headings_see_what_the_bound_says() -> None:
     env = coverage.Config(agents=2, targets=4)
     free = render.panel(env, render.FREE, 5)
-    other = render.play(env, render.scripted(env, "best_window", 5), 5)
+    other = render.play(env, render.yardstick(env, "best_window", 5), 5)
     assert all(torch.equal(a.state.targets, b.state.targets) for a, b in zip(free, other, strict=True))
     bound = [float(BOUNDS["coverage"][render.FREE](env, scene.state)) for scene in free[1:]]
     assert free[-1].text.endswith(f"coverage so far {100 * sum(bound) / len(bound):.1f} %")

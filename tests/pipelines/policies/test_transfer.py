@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from pipelines.cli import main as cli
-from pipelines.policies.evaluation import Bank, Policy, score
+from pipelines.policies.evaluation import EvaluationEpisodes, Policy, score
 from pipelines.policies.transfer import TRANSFER, Size, export_transfer, sizes, transfer
 from pipelines.tracking.policy import Saved
 from pipelines.workspace.errors import InputError
@@ -36,7 +36,7 @@ def test_the_table_holds_what_evaluation_says(tmp_path: Path) -> None:
         [3, 2, 2, 2],
     ]
     for row in table.itertuples():
-        *_, values = score(one, Bank(episodes=8, agents=int(str(row.agents))))
+        *_, values = score(one, EvaluationEpisodes(episodes=8, agents=int(str(row.agents))))
         assert (row.value, row.sem) == (values["return"], values["return_sem"])
     assert set(table["run"]) == {one.saved.spec.id}
 

@@ -224,7 +224,7 @@ def test_the_code_of_a_run_is_its_method_its_task_and_the_trainer() -> None:
         "rhmc.envs.navigation",
         "rhmc.algorithms.ppo",
         "rhmc.hierarchy.executor",
-        "rhmc.scripted.yardsticks",
+        "rhmc.yardsticks.scores",
     } & set(found)
     assert len({code_id(*place) for place in PLACES}) == len(PLACES)
 
@@ -289,7 +289,7 @@ EDITS = {
         set(ENVS),
     ),
     "a comment": ("algorithms/coma.py", "register_method(", "# why\nregister_method(", set(), set()),
-    "a yardstick": ("scripted/coverage.py", "import math\n", "import math\n\nEXTRA = 1\n", set(), set()),
+    "a yardstick": ("yardsticks/coverage.py", "import math\n", "import math\n\nEXTRA = 1\n", set(), set()),
 }
 
 

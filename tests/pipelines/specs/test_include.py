@@ -14,8 +14,8 @@ base:
   algo: {kind: rhmc, encoder: pairwise}
 arms:
   full: {}
-  found: {algo: {include: found/rhmc.yaml, horizon: 4}}
-  QMIX: {algo: {include: found/qmix.yaml}}
+  found: {algo: {include: best_params/rhmc.yaml, horizon: 4}}
+  QMIX: {algo: {include: best_params/qmix.yaml}}
 seeds: 1
 steps: 1000
 """
@@ -33,13 +33,13 @@ QMIX = "algo:\n  kind: qmix\n  encoder: pairwise\n  lr: 2e-3\n"
 @pytest.fixture(autouse=True)
 def _in_a_project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "studies" / "found").mkdir(parents=True)
+    (tmp_path / "studies" / "best_params").mkdir(parents=True)
     write("rhmc", RHMC)
     write("qmix", QMIX)
 
 
 def write(name: str, text: str) -> None:
-    Path(f"studies/found/{name}.yaml").write_text(text)
+    Path(f"studies/best_params/{name}.yaml").write_text(text)
 
 
 def load(text: str = GOOD, *overrides: str) -> Study:
@@ -66,28 +66,28 @@ def test_the_arm_goes_before_what_it_includes_and_that_before_the_base() -> None
 
 
 def test_a_study_with_an_include_is_the_study_with_it_written_out() -> None:
-    written = changed("include: found/rhmc.yaml, horizon: 4", "horizon: 4, alpha: 0.3").replace(
-        "{include: found/qmix.yaml}", "{kind: qmix, encoder: pairwise, lr: 2e-3}"
+    written = changed("include: best_params/rhmc.yaml, horizon: 4", "horizon: 4, alpha: 0.3").replace(
+        "{include: best_params/qmix.yaml}", "{kind: qmix, encoder: pairwise, lr: 2e-3}"
     )
     assert load().arms == load(written).arms
     assert [run.spec.id for run in load().runs()] == [run.spec.id for run in load(written).runs()]
 
 
 def test_a_base_a_profile_and_an_override_may_include() -> None:
-    text = changed("algo: {kind: rhmc, encoder: pairwise}", "algo: {include: found/rhmc.yaml}")
+    text = changed("algo: {kind: rhmc, encoder: pairwise}", "algo: {include: best_params/rhmc.yaml}")
     assert load(text).base.algo.alpha == pytest.approx(0.3)
-    profile = GOOD + "profiles: {quick: {algo: {include: found/rhmc.yaml}}}\n"
+    profile = GOOD + "profiles: {quick: {algo: {include: best_params/rhmc.yaml}}}\n"
     assert load(profile).arms["full"].algo.alpha == pytest.approx(0.3)
-    assert load(GOOD, "algo.include=found/rhmc.yaml").base.algo.horizon == 2
-    study = load(GOOD, "arms.full.algo.include=found/rhmc.yaml")
+    assert load(GOOD, "algo.include=best_params/rhmc.yaml").base.algo.horizon == 2
+    study = load(GOOD, "arms.full.algo.include=best_params/rhmc.yaml")
     assert study.arms["full"].algo.horizon == 2
     assert study.base.algo.horizon == 1
 
 
 def test_a_variant_may_include() -> None:
-    write("letter", "algo:\n  encoder: mlp\n")
-    load(GOOD + "variants: {letter: {algo: {include: found/letter.yaml}}}\n")
-    study = Study.load("studies/x.yaml", variant="letter")
+    write("mlp", "algo:\n  encoder: mlp\n")
+    load(GOOD + "variants: {paper_faithful: {algo: {include: best_params/mlp.yaml}}}\n")
+    study = Study.load("studies/x.yaml", variant="paper_faithful")
     assert {arm.algo.encoder for arm in study.arms.values()} == {"mlp"}
     assert study.arms["found"].algo.alpha == pytest.approx(0.3)
 
@@ -100,7 +100,7 @@ def test_a_grid_takes_what_an_arm_includes_to_every_point() -> None:
 
 def test_a_task_may_be_included_as_well() -> None:
     write("task", "env:\n  kind: coverage\n  agents: 3\n")
-    study = load(changed("env: {kind: coverage, agents: 4}", "env: {include: found/task.yaml, targets: 2}"))
+    study = load(changed("env: {kind: coverage, agents: 4}", "env: {include: best_params/task.yaml, targets: 2}"))
     assert (study.base.env.agents, study.base.env.targets) == (3, 2)
 
 
@@ -130,37 +130,38 @@ def test_a_task_may_be_included_as_well() -> None:
 def test_a_fault_in_an_included_file_is_named_there(old: str, new: str, said: str) -> None:
     write("rhmc", changed(old, new, RHMC))
     start, _, end = said.partition("*")
-    lines = faults()
-    assert any(line.startswith(f"studies/found/rhmc.yaml:{start}") and line.endswith(end) for line in lines), lines
+    lines, start = faults(), f"studies/best_params/rhmc.yaml:{start}"
+    assert any(line.startswith(start) and line.endswith(end) for line in lines), lines
 
 
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
         (
-            "include: found/rhmc.yaml",
-            "include: found/rmhc.yaml",
-            "7:27: arms.found.algo.include: studies/found/rmhc.yaml: no such file; did you mean 'found/rhmc.yaml'?",
+            "include: best_params/rhmc.yaml",
+            "include: best_params/rmhc.yaml",
+            "7:27: arms.found.algo.include: studies/best_params/rmhc.yaml: no such file; "
+            "did you mean 'best_params/rhmc.yaml'?",
         ),
         (
-            "include: found/rhmc.yaml",
+            "include: best_params/rhmc.yaml",
             "include: 3",
             "7:27: arms.found.algo.include: 3 is not allowed; must be the path of a file",
         ),
         (
             "horizon: 4",
             "kind: qmix",
-            "7:50: arms.found.algo.kind: 'qmix' is not allowed; what is included here is of kind 'rhmc'",
+            "7:56: arms.found.algo.kind: 'qmix' is not allowed; what is included here is of kind 'rhmc'",
         ),
         (
             "env: {kind: coverage, agents: 4}",
-            "env: {include: found/rhmc.yaml}",
-            "3:18: base.env.include: studies/found/rhmc.yaml has no mapping 'env'; it has: algo, provenance",
+            "env: {include: best_params/rhmc.yaml}",
+            "3:18: base.env.include: studies/best_params/rhmc.yaml has no mapping 'env'; it has: algo, provenance",
         ),
         (
             "horizon: 4",
             "horizon: 0",
-            "7:53: arms.found.algo.horizon: 0 is not allowed; must be greater than or equal to 1",
+            "7:59: arms.found.algo.horizon: 0 is not allowed; must be greater than or equal to 1",
         ),
     ],
 )
@@ -170,10 +171,10 @@ def test_a_fault_of_the_study_is_named_there(old: str, new: str, said: str) -> N
 
 def test_what_is_missing_in_an_included_file_is_missing_in_the_study() -> None:
     write("rhmc", "algo: {alpha: 0.3}\n")
-    text = changed("algo: {kind: rhmc, encoder: pairwise}", "algo: {include: found/rhmc.yaml}")
+    text = changed("algo: {kind: rhmc, encoder: pairwise}", "algo: {include: best_params/rhmc.yaml}")
     assert any(line.startswith("studies/x.yaml:4:3: base.algo.kind: missing; allowed: rhmc,") for line in faults(text))
     write("rhmc", "")
-    assert "studies/x.yaml:7:27: arms.found.algo.include: studies/found/rhmc.yaml: empty;" in "\n".join(faults())
+    assert "studies/x.yaml:7:27: arms.found.algo.include: studies/best_params/rhmc.yaml: empty;" in "\n".join(faults())
 
 
 def test_another_kind_must_state_what_all_have_in_common_also_when_included() -> None:

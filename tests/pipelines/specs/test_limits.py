@@ -1,4 +1,4 @@
-"""What a check finds before a launch: numbers that are absurd, devices, what cannot go together, budgets too small."""
+"""Findings of a check before a launch: numbers that are absurd, devices, what cannot go together, budgets too small."""
 
 from pathlib import Path
 from typing import Any
@@ -157,7 +157,7 @@ def test_a_device_that_is_not_here_is_found_before_anything_starts(
     "words",
     [
         ["evaluate", "x.yaml", "--episodes", "1000000000"],
-        ["evaluate", "x.yaml", "--bank", "9223372036854775808"],
+        ["evaluate", "x.yaml", "--eval-seed", "9223372036854775808"],
         ["transfer", "x.yaml", "--out", "o", "--agents", "2", "--jobs", "100000"],
         ["transfer", "x.yaml", "--out", "o", "--targets", "1000"],
         ["yardsticks", "coverage", "--seed", "9223372036854775808"],
@@ -258,7 +258,7 @@ def test_every_arm_of_the_studies_at_hand_learns(path: Path, profile: str) -> No
     for variant in variants:
         loaded = kind.load(path, profile) if variant is None else Study.load(path, profile, variant=variant)
         late = "50,000 steps end before 'hitmac' learns"
-        known = profile == "quick" and path.stem in ("coordinator", "coverage", "coverage_letter")
+        known = profile == "quick" and path.stem in ("coordinator", "coverage", "coverage_paper_faithful")
         assert [remark for remark in loaded.remarks if not (known and late in remark)] == []
 
 

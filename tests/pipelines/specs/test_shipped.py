@@ -28,7 +28,7 @@ def test_a_copied_study_is_the_study(name: str, tmp_path: Path) -> None:
 def test_what_a_study_includes_comes_with_it_and_nothing_else(tmp_path: Path) -> None:
     found = {path.relative_to(tmp_path).as_posix() for path in copy("searched", tmp_path)}
     assert found == {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.yaml")}
-    assert {"searched.yaml", "found/search_rhmc.rhmc.quick.yaml"} <= found
+    assert {"searched.yaml", "best_params/search_rhmc.rhmc.quick.yaml"} <= found
     other = {path.relative_to(tmp_path / "other").as_posix() for path in copy("steadiness", tmp_path / "other")}
     assert other == {"steadiness.yaml", "settings/coverage.yaml", "settings/coverage/rhmc.yaml"}
 
@@ -41,7 +41,7 @@ def test_a_copied_study_takes_what_was_copied_with_it(tmp_path: Path) -> None:
 
 
 def test_a_file_that_is_there_is_left_alone(tmp_path: Path) -> None:
-    mine = tmp_path / "found" / "search_rhmc.rhmc.quick.yaml"
+    mine = tmp_path / "best_params" / "search_rhmc.rhmc.quick.yaml"
     mine.parent.mkdir()
     mine.write_text("mine: yes\n")
     with pytest.raises(InputError, match=f"^{mine}: something else is there; move it away, or name another folder"):

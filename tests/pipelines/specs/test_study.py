@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from pipelines.specs.document import Node, Place, merge, plain
 from pipelines.specs.study import PROFILES, RunSpec, Study, StudyError, changes
 from rhmc.algorithms import ALGORITHMS
+from tests.support import changing
 
 GOOD = """\
 question: Which?
@@ -25,6 +26,7 @@ arms:
 seeds: {quick: 2, paper: 3}
 steps: 1000
 """
+changed = changing(GOOD)
 ARMS = GOOD[GOOD.index("arms:") : GOOD.index("seeds:")]
 ROOT = Path(__file__).parents[3]
 
@@ -44,11 +46,6 @@ def faults(text: str, *overrides: str, profile: str = "quick") -> list[str]:
     with pytest.raises(StudyError) as caught:
         load(text, profile, *overrides)
     return str(caught.value).splitlines()
-
-
-def changed(old: str, new: str) -> str:
-    assert GOOD.count(old) == 1
-    return GOOD.replace(old, new)
 
 
 # What a study resolves to
@@ -150,11 +147,11 @@ def test_methods_are_compared_on_one_task_and_one_encoder(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["ablation", "coverage", "navigation", "scaling"])
-def test_to_the_letter_every_method_has_the_papers_encoder_and_observation(name: str) -> None:
+def test_paper_faithful_every_method_has_the_papers_encoder_and_observation(name: str) -> None:
     path = ROOT / "studies" / f"{name}.yaml"
-    study, strong = (Study.load(path, "paper", variant=variant) for variant in ("letter", None))
+    study, strong = (Study.load(path, "paper", variant=variant) for variant in ("paper_faithful", None))
     assert {(a.algo.encoder, a.env.observation) for a in study.arms.values()} == {("mlp", "paper")}
-    assert (study.name, strong.name) == (f"{name}@letter", name)
+    assert (study.name, strong.name) == (f"{name}@paper_faithful", name)
     for arm, setting in strong.arms.items():
         assert set(changes(setting, study.arms[arm])) == {"algo.encoder", "env.observation"}
 
@@ -365,28 +362,38 @@ def test_whatever_is_written_into_a_grid_is_read_or_refused(text: str, at: int, 
 # Variants
 
 VARIANTS = (
-    GOOD + "variants:\n  letter: {env: {observation: paper}, algo: {encoder: mlp}}\n  long: {trainer: {num_envs: 8}}\n"
+    GOOD
+    + "variants:\n  paper_faithful: {env: {observation: paper}, algo: {encoder: mlp}}\n"
+    + "  long: {trainer: {num_envs: 8}}\n"
 )
 
 
 def test_a_variant_changes_every_arm_whatever_its_kind_and_has_a_name_of_its_own() -> None:
     Path("studies/x.yaml").write_text(VARIANTS)
-    plain, letter, long = (Study.load("studies/x.yaml", variant=v) for v in (None, "letter", "long"))
-    assert [study.name for study in (plain, letter, long)] == ["x", "x@letter", "x@long"]
-    assert {run.study for run in letter.runs()} == {"x@letter"}
+    plain, faithful, long = (Study.load("studies/x.yaml", variant=v) for v in (None, "paper_faithful", "long"))
+    assert [study.name for study in (plain, faithful, long)] == ["x", "x@paper_faithful", "x@long"]
+    assert {run.study for run in faithful.runs()} == {"x@paper_faithful"}
     assert plain.runs() == load(GOOD).runs()
-    assert {(a.algo.encoder, a.env.observation) for a in letter.arms.values()} == {("mlp", "paper")}
-    assert [a.algo.kind for a in letter.arms.values()] == ["rhmc", "rhmc", "iql"]
-    assert letter.arms["none"].algo.regulator == "none"
-    assert changes(letter.base, letter.arms["none"]) == {"algo.regulator": "none"}
+    assert {(a.algo.encoder, a.env.observation) for a in faithful.arms.values()} == {("mlp", "paper")}
+    assert [a.algo.kind for a in faithful.arms.values()] == ["rhmc", "rhmc", "iql"]
+    assert faithful.arms["none"].algo.regulator == "none"
+    assert changes(faithful.base, faithful.arms["none"]) == {"algo.regulator": "none"}
     assert {a.trainer.num_envs for a in long.arms.values()} == {8}
 
 
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("encoder: mlp", "encoder: mpl", ["13:55: variants.letter.algo.encoder: 'mpl' is not allowed; ... 'mlp'?"]),
-        ("letter: {env", "letter: {envs", ["13:12: variants.letter.envs: unknown key 'envs'; ... did you mean 'env'?"]),
+        (
+            "encoder: mlp",
+            "encoder: mpl",
+            ["13:63: variants.paper_faithful.algo.encoder: 'mpl' is not allowed; ... 'mlp'?"],
+        ),
+        (
+            "paper_faithful: {env",
+            "paper_faithful: {envs",
+            ["13:20: variants.paper_faithful.envs: unknown key 'envs'; ... did you mean 'env'?"],
+        ),
         ("long:", "a/b:", ["14:3: variants.a/b: a variant is named with letters, digits, '-' and '_' only"]),
         (
             "trainer: {num_envs: 8}",
@@ -405,13 +412,13 @@ def test_faulty_variants(old: str, new: str, said: list[str]) -> None:
 
 def test_an_unknown_variant() -> None:
     for text, said in [
-        (VARIANTS, "allowed: letter, long; did you mean 'letter'?"),
+        (VARIANTS, "allowed: paper_faithful, long; did you mean 'paper_faithful'?"),
         (GOOD, "this study has no variants"),
     ]:
         Path("studies/x.yaml").write_text(text)
         with pytest.raises(StudyError) as caught:
-            Study.load("studies/x.yaml", variant="leter")
-        assert str(caught.value) == f"--variant: 'leter' is not allowed; {said}"
+            Study.load("studies/x.yaml", variant="paper_faithfull")
+        assert str(caught.value) == f"--variant: 'paper_faithfull' is not allowed; {said}"
 
 
 # Faulty files. Each: what is written instead of what, and what is said, `...` for a long list in the middle.
@@ -645,7 +652,7 @@ def test_merging_without_kinds(a: dict, b: dict, c: dict) -> None:
 
 
 def mixed(*trees: dict) -> bool:
-    """Whether a key holds a mapping in one tree and something else in another, at any depth."""
+    """True if a key holds a mapping in one tree and something else in another, at any depth."""
     for key in {key for tree in trees for key in tree}:
         values = [tree[key] for tree in trees if key in tree]
         mappings = [value for value in values if isinstance(value, dict)]

@@ -171,7 +171,7 @@ def test_how_a_run_looks_in_mlflow(home: Path) -> None:
     expected = {
         "study": "demo",
         "profile": "quick",
-        "variant": "full",
+        "arm": "full",
         "algorithm": "iql",
         "task": "coverage",
         "seed": "3",
@@ -194,6 +194,25 @@ def test_how_a_run_looks_in_mlflow(home: Path) -> None:
     assert parent.data.metrics == {}
     assert sorted(a.path for a in tracker.client.list_artifacts(log.ref)) == ["config.yaml", "policy.pt"]
     assert run.info.artifact_uri.startswith((home / "artifacts").as_uri())
+
+
+@pytest.mark.parametrize("lister", ["_listed_sqlite", "_listed_client"])
+def test_runs_of_an_older_version_are_set_aside(home: Path, lister: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    tracker = MlflowTracker(STUDY, Home(home))
+    assert tracker.remarks == []
+    old = tracker.start(CARD)
+    tracker.client.set_tag(old.ref, "variant", CARD.arm)
+    tracker.client.delete_tag(old.ref, "arm")
+    for name in ("other", "third"):
+        tracker.start(CARD._replace(spec_id=name)).finish("finished")
+    monkeypatch.setattr(MlflowTracker, "_listed_sqlite", getattr(MlflowTracker, lister))
+    for again in (MlflowTracker(STUDY, Home(home)), open_existing(STUDY, Home(home))):
+        assert again is not None
+        assert [run.key for run in again.recorded()] == ["other-c0de", "third-c0de"]
+        assert [remark.partition("; ")[0] for remark in again.remarks] == [
+            "the log holds runs of an older version (without the tag 'arm'), which are set aside: 1"
+        ]
+    assert MlflowTracker(STUDY, Home(home)).start(CARD).ref != old.ref
 
 
 def test_a_study_keeps_one_parent_which_ends_as_the_launch_does(home: Path) -> None:
@@ -345,11 +364,11 @@ def test_where_the_log_lies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert mlflow_tracker.tracking_uri(Home(tmp_path)) == "http://tracking:5000"
 
 
-# What may be in the way: one line that names it
+# Environment errors: one line that names them
 
 
 def refused(home: Path) -> str:
-    """What opening the log says."""
+    """The remarks of an opened log."""
     with pytest.raises(StoreError) as caught:
         MlflowTracker(STUDY, Home(home))
     assert "\n" not in str(caught.value)

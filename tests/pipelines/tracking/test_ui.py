@@ -1,4 +1,4 @@
-"""What a person sees in MLflow: names, saved views, and the parent run of a study."""
+"""The view of MLflow: names, saved views, and the parent run of a study."""
 
 import base64
 import csv
@@ -13,9 +13,7 @@ from PIL import Image
 
 from pipelines.specs.safe_names import HEADLINES, full, shown
 from pipelines.specs.study import Setting
-from pipelines.tracking import arm_colours as legend
-from pipelines.tracking import mlflow_tracker, overview
-from pipelines.tracking import saved_views as views
+from pipelines.tracking import arm_colours, mlflow_tracker, overview, saved_views
 from pipelines.tracking.mlflow_tracker import MlflowTracker, addresses
 from pipelines.tracking.overview import Overview, Run, figure, so_far, table
 from pipelines.tracking.plan import study_card
@@ -88,14 +86,14 @@ def unpacked(tag: str) -> dict[str, Any]:
 
 
 def test_a_view_is_a_tag_that_unpacks_to_its_state() -> None:
-    for view in views.views(PARAMS, STUDY.arms):
+    for view in saved_views.views(PARAMS, STUDY.arms):
         assert unpacked(view.written(5)) == view.state
         assert len(view.written(5)) < 20_000  # what MLflow takes
         assert view.written(5) == view.written(5)
 
 
 def test_charts_are_grouped_by_arm_and_show_the_headlines_first() -> None:
-    curves, finals, every = views.views(PARAMS, STUDY.arms)
+    curves, finals, every = saved_views.views(PARAMS, STUDY.arms)
     for view in (curves, finals):
         assert view.state["groupBy"]["groupByKeys"] == [{"mode": "tag", "groupByData": "legend"}]
     assert every.state["groupBy"] is None
@@ -119,7 +117,7 @@ def test_charts_are_grouped_by_arm_and_show_the_headlines_first() -> None:
 
 def parallel(params: dict[str, list[str]]) -> dict[str, list[str]]:
     """The axes of each chart of parallel coordinates, by its section."""
-    state = views.views(params)[-1].state
+    state = saved_views.views(params)[-1].state
     names = {section["uuid"]: section["name"] for section in state["compareRunSections"]}
     charts = [chart for chart in state["compareRunCharts"] if chart["type"] == "PARALLEL"]
     assert all(chart["selectedMetrics"] == ["final/return"] for chart in charts)
@@ -141,7 +139,7 @@ def test_no_run_is_left_out_of_the_parallel_coordinates_for_a_setting_that_it_ha
 
 def test_a_view_of_a_thousand_arms_still_fits_into_a_tag() -> None:
     arms = [f"RHMC, alpha={k}, agents={k}, horizon={k}" for k in range(1000)]
-    assert all(len(view.written(5)) < 20_000 for view in views.views(PARAMS, arms))
+    assert all(len(view.written(5)) < 20_000 for view in saved_views.views(PARAMS, arms))
 
 
 def test_what_varies_is_told_by_method() -> None:
@@ -160,28 +158,28 @@ def of_kind(kind: str, **algo: Any) -> Setting:
 
 def seen(text: str) -> str:
     """A text without what is not seen of it."""
-    return "".join(letter for letter in text if letter not in legend.MARKS)
+    return "".join(letter for letter in text if letter not in arm_colours.MARKS)
 
 
 @pytest.mark.parametrize(("name", "colour"), [("tag.variant.IQL", "#facb66"), ("tag.variant.no regulation", "#facb66")])
 def test_the_hash_is_that_of_mlflow(name: str, colour: str) -> None:
-    assert legend.PALETTE[legend._hash(name) % len(legend.PALETTE)] == colour  # as its page showed them
+    assert arm_colours.PALETTE[arm_colours._hash(name) % len(arm_colours.PALETTE)] == colour  # as its page showed them
 
 
 def test_every_arm_has_a_colour_of_its_own_and_reads_as_before() -> None:
     arms = [f"RHMC, alpha={k}" for k in range(29)]
-    legends = [legend.legend(arm, place) for place, arm in enumerate(arms)]
+    legends = [arm_colours.legend(arm, place) for place, arm in enumerate(arms)]
     assert list(map(seen, legends)) == arms
-    hashed = [legend.PALETTE[legend._hash(legend.group(name)) % 29] for name in legends]
-    assert hashed == [legend.colour(place) for place in range(29)]
+    hashed = [arm_colours.PALETTE[arm_colours._hash(arm_colours.group(name)) % 29] for name in legends]
+    assert hashed == [arm_colours.colour(place) for place in range(29)]
     assert len(set(hashed)) == 29
-    assert legend.colour(29) == legend.colour(0)
+    assert arm_colours.colour(29) == arm_colours.colour(0)
 
 
 def looks(tracker: MlflowTracker) -> dict[str, tuple[str, str]]:
     """Legend and colour of the runs, by arm."""
     tags = [run.data.tags for run in tracker._search("tags.role = 'run'")]
-    return {one["variant"]: (one["legend"], one.get("mlflow.runColor", "")) for one in tags}
+    return {one["arm"]: (one["legend"], one.get("mlflow.runColor", "")) for one in tags}
 
 
 def test_an_arm_keeps_its_colour_when_the_study_is_extended(home: Path) -> None:
@@ -190,25 +188,17 @@ def test_an_arm_keeps_its_colour_when_the_study_is_extended(home: Path) -> None:
         tracker.start(CARD._replace(arm=arm, spec_id=arm))
     first = looks(tracker)
     assert first == {
-        "slow": (legend.legend("slow", 0), legend.colour(0)),
-        "fast": (legend.legend("fast", 1), legend.colour(1)),
+        "slow": (arm_colours.legend("slow", 0), arm_colours.colour(0)),
+        "fast": (arm_colours.legend("fast", 1), arm_colours.colour(1)),
         "unplanned": ("unplanned", ""),
     }
     tracker = MlflowTracker(STUDY._replace(arms=["new", "fast", "slow"]), Home(home))
     tracker.start(CARD._replace(arm="new", spec_id="new"))
-    assert looks(tracker) == first | {"new": (legend.legend("new", 2), legend.colour(2))}
+    assert looks(tracker) == first | {"new": (arm_colours.legend("new", 2), arm_colours.colour(2))}
 
 
-def test_runs_of_an_earlier_version_are_coloured_by_the_next_launch(home: Path) -> None:
-    tracker = MlflowTracker(STUDY, Home(home))
-    ref = tracker.start(CARD._replace(arm="fast")).ref
-    for tag in ("legend", "mlflow.runColor"):
-        tracker.client.delete_tag(ref, tag)
-    assert looks(MlflowTracker(STUDY, Home(home))) == {"fast": (legend.legend("fast", 1), legend.colour(1))}
-
-
-@pytest.mark.parametrize("view", views.views({"iql": ["seed"]}), ids=lambda view: view.key)
-def test_every_chart_is_in_a_section_and_has_a_name_of_its_own(view: views.View) -> None:
+@pytest.mark.parametrize("view", saved_views.views({"iql": ["seed"]}), ids=lambda view: view.key)
+def test_every_chart_is_in_a_section_and_has_a_name_of_its_own(view: saved_views.View) -> None:
     sections = [section["uuid"] for section in view.state.get("compareRunSections", [])]
     charts = view.state.get("compareRunCharts", [])
     assert {chart["metricSectionId"] for chart in charts} <= set(sections)
@@ -219,7 +209,7 @@ def test_every_chart_is_in_a_section_and_has_a_name_of_its_own(view: views.View)
 def test_a_study_has_its_views_as_it_opens(home: Path) -> None:
     tracker = MlflowTracker(STUDY, Home(home))
     tags = tracker.client.get_experiment(tracker.experiment).tags
-    for view in views.views(STUDY.params, [legend.legend("slow", 0), legend.legend("fast", 1)]):
+    for view in saved_views.views(STUDY.params, [arm_colours.legend("slow", 0), arm_colours.legend("fast", 1)]):
         assert unpacked(tags[view.tag]) == view.state
     assert list(map(seen, unpacked(tags["mlflow.sharedViewState.rhmc-finals"])["groupsExpanded"])) == [
         "tag.legend.slow",
@@ -239,14 +229,14 @@ def test_a_study_has_its_views_as_it_opens(home: Path) -> None:
 def test_a_study_that_was_logged_without_views_gets_them_when_it_is_shown(home: Path) -> None:
     tracker = MlflowTracker(STUDY, Home(home))
     tracker.start(CARD)
-    for view in views.views({}):
+    for view in saved_views.views({}):
         tracker.client.delete_experiment_tag(tracker.experiment, view.tag)
     assert len(addresses(tracker.uri, "")) == 3
     tags = tracker.client.get_experiment(tracker.experiment).tags
     state = unpacked(tags["mlflow.sharedViewState.rhmc-parallel"])
     assert sorted(state["compareRunCharts"][0]["selectedParams"]) == ["algo.lr", "method", "seed"]
     finals = unpacked(tags["mlflow.sharedViewState.rhmc-finals"])
-    assert finals["groupBy"]["groupByKeys"] == [{"mode": "tag", "groupByData": "variant"}]
+    assert finals["groupBy"]["groupByKeys"] == [{"mode": "tag", "groupByData": "arm"}]
 
 
 def test_views_pass_over_stale_runs_and_the_parent(home: Path) -> None:
@@ -254,7 +244,7 @@ def test_views_pass_over_stale_runs_and_the_parent(home: Path) -> None:
     refs = [tracker.start(CARD._replace(spec_id=spec_id)).ref for spec_id in ("1", "2")]
 
     def shown() -> set[str]:
-        query = views.views({})[0].state["searchFilter"]
+        query = saved_views.views({})[0].state["searchFilter"]
         return {run.info.run_id for run in tracker.client.search_runs([str(tracker.experiment)], query)}
 
     assert shown() == set(refs)
@@ -266,7 +256,7 @@ def test_an_experiment_of_somebody_else_is_left_alone(home: Path) -> None:
     tracker = MlflowTracker(STUDY, Home(home))
     theirs = tracker.client.create_experiment("theirs")
     assert {name for name, _, _ in addresses(tracker.uri, "")} == {"demo (quick)"}
-    assert not any(tag.startswith(views.TAG) for tag in tracker.client.get_experiment(theirs).tags)
+    assert not any(tag.startswith(saved_views.TAG) for tag in tracker.client.get_experiment(theirs).tags)
 
 
 def test_an_empty_file_is_not_made_a_store(tmp_path: Path) -> None:

@@ -8,10 +8,10 @@ import pytest
 import ray
 from ray.exceptions import ActorDiedError
 
-from pipelines.execution import cluster as nodes
+from pipelines.execution import cluster
 from pipelines.execution.cluster import DEATHS, NODE_DIED, Place
 from pipelines.execution.seed_group import Seeds
-from pipelines.tuning import ray_workers as module
+from pipelines.tuning import ray_workers
 from pipelines.tuning.ray_workers import Failed, Pool, Taken, TrialJob
 from rhmc.types import Metrics
 from tests.pipelines.support import tiny
@@ -104,8 +104,8 @@ def test_a_trial_whose_workers_die_without_getting_further_fails(
         return dict(answer)
 
     lives = {"here": {}}
-    monkeypatch.setattr(nodes, "alive", lambda: lives)
-    monkeypatch.setattr(module.ray, "get", get)
+    monkeypatch.setattr(cluster, "alive", lambda: lives)
+    monkeypatch.setattr(ray_workers.ray, "get", get)
     pool = Handed(1, 1)
     pool.begin(job(tmp_path, "a"))
     point = {"points": [{"step": 0.0}], "place": Place("here", "host")}
@@ -124,8 +124,8 @@ def test_what_dies_with_its_node_does_not_fail(tmp_path: Path, monkeypatch: pyte
         def __str__(self) -> str:
             return f"because {NODE_DIED}. Node Id: c"
 
-    monkeypatch.setattr(nodes, "alive", dict)
-    monkeypatch.setattr(module.ray, "get", get)
+    monkeypatch.setattr(cluster, "alive", dict)
+    monkeypatch.setattr(ray_workers.ray, "get", get)
     pool = Handed(1, 1)
     pool.begin(job(tmp_path, "a"))
     for _ in range(2 * DEATHS):

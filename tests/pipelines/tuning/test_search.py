@@ -33,17 +33,18 @@ from pipelines.specs.search import EVAL_SEED, FIRST_SEED, Dimension, Search
 from pipelines.specs.study import Setting, Study, StudyError
 from pipelines.tracking.mlflow_tracker import open_existing
 from pipelines.tracking.tracker import MemoryRun, MemoryTracker, points_of
-from pipelines.tuning import ray_workers as pool
+from pipelines.tuning import ray_workers
 from pipelines.tuning.best_params import file_name, winner_yaml
 from pipelines.tuning.ray_workers import Failed
 from pipelines.tuning.search_plots import plots
-from pipelines.tuning.search_run import Book, Drive, results, run_search, search_card, show_search
-from pipelines.tuning.trials import ATTEMPTS, Ledger, look, open_storage
+from pipelines.tuning.search_run import Drive, TrialLog, results, run_search, search_card, show_search
+from pipelines.tuning.trials import ATTEMPTS, ArmStudy, look, open_storage
 from pipelines.workspace.work_folder import Home, StoreError
 from rhmc.training.trainer import Trainer
 from tests.pipelines.execution.test_trainable import same
 from tests.pipelines.support import CODE, interrupt, setting
 from tests.robustness.killed import PoolHere
+from tests.support import changing
 
 ROOT = Path(__file__).parents[3]
 GOOD = """\
@@ -68,6 +69,7 @@ seeds: 2
 steps: 600
 sampler: {startup: 2}
 """
+changed = changing(GOOD)
 
 
 @pytest.fixture(autouse=True)
@@ -75,7 +77,7 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty project as the current folder."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("OPTUNA_STORAGE", raising=False)
-    (tmp_path / "studies" / "found").mkdir(parents=True)
+    (tmp_path / "studies" / "best_params").mkdir(parents=True)
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     return tmp_path
 
@@ -83,11 +85,6 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def load(text: str = GOOD, profile: str = "quick", *overrides: str) -> Search:
     Path("studies/search_x.yaml").write_text(text)
     return Search.load("studies/search_x.yaml", profile, overrides)
-
-
-def changed(old: str, new: str) -> str:
-    assert GOOD.count(old) == 1
-    return GOOD.replace(old, new)
 
 
 # The file
@@ -353,7 +350,7 @@ def point(curves: dict[int, list[float]], k: int, last: int) -> dict[str, float]
 
 
 class World:
-    """What outlives a launch: Optuna's storage, the log and the checkpoints."""
+    """The state that outlives a launch: Optuna's storage, the log and the checkpoints."""
 
     def __init__(self, search: Search, folder: Path, storage: Any = None) -> None:
         self.search, self.folder = search, folder
@@ -362,25 +359,25 @@ class World:
         self.disk: dict[str, int] = {}
         self.out = StringIO()
 
-    def ledgers(self) -> list[Ledger]:
-        return [Ledger(self.search, arm, self.storage) for arm in self.search.arms]
+    def arm_studies(self) -> list[ArmStudy]:
+        return [ArmStudy(self.search, arm, self.storage) for arm in self.search.arms]
 
     def launch(self, shape: Curve = curve, size: int = 1, twin: Twin | None = None) -> Twin:
-        ledgers = self.ledgers()
-        for ledger in ledgers:
-            ledger.take_up()
+        arm_studies = self.arm_studies()
+        for arm_study in arm_studies:
+            arm_study.take_up()
         workers = twin or Twin(self.disk, shape, size)
         tracker = MemoryTracker(search_card(self.search), self.shelf)
-        book = Book(self.search, tracker, PlainBoard(Console(file=self.out)))
-        Drive(self.search, ledgers, workers, book, Home(self.folder), self.folder / "stop").run()
+        trial_log = TrialLog(self.search, tracker, PlainBoard(Console(file=self.out)))
+        Drive(self.search, arm_studies, workers, trial_log, Home(self.folder), self.folder / "stop").run()
         return workers
 
     def outcome(self) -> dict[str, Any]:
-        """What came of every place of every arm, and what the log shows."""
+        """The result of every trial of every arm, and the log's content."""
         trials = {
-            (ledger.arm, place): (t.state.name, t.params, t.values, t.intermediate_values)
-            for ledger in self.ledgers()
-            for place, t in sorted(ledger.latest().items())
+            (arm_study.arm, place): (t.state.name, t.params, t.values, t.intermediate_values)
+            for arm_study in self.arm_studies()
+            for place, t in sorted(arm_study.latest().items())
         }
         log = {(r.card.arm, r.card.trial): (r.status, r.tags, r.card.params, points_of(r.values)) for r in self.shelf}
         assert len(log) == len(self.shelf), "a trial has two runs in the log"
@@ -388,10 +385,10 @@ class World:
 
     def winners(self) -> list[str]:
         texts = []
-        for ledger in self.ledgers():
-            best = ledger.best()
+        for arm_study in self.arm_studies():
+            best = arm_study.best()
             assert best is not None
-            texts.append(winner_yaml(self.search, ledger.arm, best, ledger.counts()))
+            texts.append(winner_yaml(self.search, arm_study.arm, best, arm_study.counts()))
         return texts
 
 
@@ -399,25 +396,25 @@ def test_every_arm_is_tried_as_often_and_all_advance_together(tmp_path: Path) ->
     world = World(load(), tmp_path)
     workers = world.launch(size=2)
     assert workers.trained == 2 * 5 * 4  # arms, trials, points
-    assert [ledger.counts()["complete"] for ledger in world.ledgers()] == [5, 5]
+    assert [arm_study.counts()["complete"] for arm_study in world.arm_studies()] == [5, 5]
     order = [run.card.arm for run in world.shelf]
     assert all({"IQL", "VDN"} == set(order[k : k + 2]) for k in range(0, 10, 2))
-    assert {ledger.left for ledger in world.ledgers()} == {0}
+    assert {arm_study.left for arm_study in world.arm_studies()} == {0}
     assert world.launch().trained == 0
 
 
 def test_a_trial_is_judged_by_the_mean_of_its_seeds(tmp_path: Path) -> None:
     world = World(load(), tmp_path)
     world.launch()
-    for ledger in world.ledgers():
-        for trial in ledger.latest().values():
+    for arm_study in world.arm_studies():
+        for trial in arm_study.latest().values():
             returns = [10 - abs(math.log10(trial.params["lr"]) + 3) + k / 100 for k in (0, 1)]
             assert trial.user_attrs["returns"] == pytest.approx(returns)
             assert trial.values == pytest.approx([sum(returns) / 2])
             assert list(trial.intermediate_values) == [0, 1, 2, 3]
-        best = ledger.best()
+        best = arm_study.best()
         assert best is not None
-        assert best.value == max(trial.values[0] for trial in ledger.latest().values())
+        assert best.value == max(trial.values[0] for trial in arm_study.latest().values())
 
 
 def test_the_log_has_a_run_for_each_trial(tmp_path: Path) -> None:
@@ -466,14 +463,14 @@ def test_trials_that_fall_behind_are_given_up(tmp_path: Path, pruner: str) -> No
     world = World(load(GOOD + pruner), tmp_path)
     trained = world.launch().trained
     assert trained < 2 * 5 * 4
-    for ledger in world.ledgers():
-        trials = ledger.latest().values()
-        counts = ledger.counts()
+    for arm_study in world.arm_studies():
+        trials = arm_study.latest().values()
+        counts = arm_study.counts()
         assert counts["complete"] + counts["pruned"] == 5
         assert counts["pruned"] > 0
         pruned = [t for t in trials if t.state.name == "PRUNED"]
         assert all(0 < max(t.intermediate_values) < 3 for t in pruned)
-        best = ledger.best()
+        best = arm_study.best()
         assert best is not None
         assert best.value == max(t.values[0] for t in trials if t.state.name == "COMPLETE")
     states = [(run.tags["state"], run.status, "objective" in points_of(run.values)[-1]) for run in world.shelf]
@@ -487,11 +484,13 @@ def test_no_finite_return_ends_a_trial_and_counts(tmp_path: Path) -> None:
 
     world = World(load(), tmp_path)
     world.launch(wild)
-    for ledger in world.ledgers():
-        whys = [t.user_attrs["pruned"] for t in ledger.latest().values() if t.state.name == "PRUNED"]
+    for arm_study in world.arm_studies():
+        whys = [t.user_attrs["pruned"] for t in arm_study.latest().values() if t.state.name == "PRUNED"]
         assert whys
-        assert set(whys) == {"no finite return at step 600" if ledger.arm == "VDN" else "no finite return at step 200"}
-        assert ledger.closed == 5
+        assert set(whys) == {
+            "no finite return at step 600" if arm_study.arm == "VDN" else "no finite return at step 200"
+        }
+        assert arm_study.closed == 5
 
 
 def test_a_trial_that_diverges_is_pruned_and_never_tried_again(tmp_path: Path) -> None:
@@ -502,12 +501,12 @@ def test_a_trial_that_diverges_is_pruned_and_never_tried_again(tmp_path: Path) -
 
     world = World(load(), tmp_path)
     world.launch(diverging)
-    gone = [t for ledger in world.ledgers() for t in ledger.latest().values() if t.state.name == "PRUNED"]
+    gone = [t for arm_study in world.arm_studies() for t in arm_study.latest().values() if t.state.name == "PRUNED"]
     assert gone
     assert {t.user_attrs["pruned"] for t in gone} == {"diverged: train/td_loss is inf at step 200"}
     assert all(t.params["lr"] > 1e-3 for t in gone)
-    assert [ledger.closed for ledger in world.ledgers()] == [5, 5]  # the search went on, and is whole
-    assert all(best.params["lr"] <= 1e-3 for ledger in world.ledgers() if (best := ledger.best()))
+    assert [arm_study.closed for arm_study in world.arm_studies()] == [5, 5]  # the search went on, and is whole
+    assert all(best.params["lr"] <= 1e-3 for arm_study in world.arm_studies() if (best := arm_study.best()))
     logs = [run for run in world.shelf if run.status == "failed"]
     assert len(logs) == len(gone)
     assert {(run.tags["state"], run.tags["error"]) for run in logs} == {
@@ -524,13 +523,13 @@ def test_a_trial_that_raises_is_tried_in_the_next_launches_and_then_left(tmp_pat
 
     world = World(load(), tmp_path)
     world.launch(raising)
-    failed = sum(ledger.counts()["failed"] for ledger in world.ledgers())
+    failed = sum(arm_study.counts()["failed"] for arm_study in world.arm_studies())
     assert 0 < failed < 10
-    assert sum(ledger.closed for ledger in world.ledgers()) == 10 - failed
+    assert sum(arm_study.closed for arm_study in world.arm_studies()) == 10 - failed
     run = next(run for run in world.shelf if run.status == "failed")
     assert (run.tags["error"], run.tags["state"]) == ("ValueError: no such rate", "failed")
     assert [world.launch(raising).trained for _ in range(ATTEMPTS)] == [failed] * (ATTEMPTS - 1) + [0]
-    assert {ledger.left for ledger in world.ledgers()} == {0}
+    assert {arm_study.left for arm_study in world.arm_studies()} == {0}
 
 
 def test_what_failed_once_may_end_well(tmp_path: Path) -> None:
@@ -540,7 +539,7 @@ def test_what_failed_once_may_end_well(tmp_path: Path) -> None:
     world = World(load(), tmp_path)
     world.launch(raising)
     world.launch()
-    assert [ledger.counts()["complete"] for ledger in world.ledgers()] == [5, 5]
+    assert [arm_study.counts()["complete"] for arm_study in world.arm_studies()] == [5, 5]
     assert {run.status for run in world.shelf} == {"finished"}
 
 
@@ -586,7 +585,7 @@ def test_a_kill_at_any_write_changes_nothing(tmp_path: Path, pruner: str) -> Non
     for write in itertools.count():
         storage = Fuse()
         world = World(search, tmp_path, storage)
-        world.ledgers()
+        world.arm_studies()
         died = False
         for left in (write, 3 * write % 17, math.inf):  # the second time perhaps while it takes up the first
             storage.left = left
@@ -599,18 +598,20 @@ def test_a_kill_at_any_write_changes_nothing(tmp_path: Path, pruner: str) -> Non
         kills += 1
         assert world.outcome() == expected, write
         assert world.winners() == whole.winners()
-        assert {ledger.counts()["running"] + ledger.counts()["waiting"] for ledger in world.ledgers()} == {0}
+        assert {arm_study.counts()["running"] + arm_study.counts()["waiting"] for arm_study in world.arm_studies()} == {
+            0
+        }
     assert kills > 25
 
 
 def test_what_a_launch_left_open_is_counted_once(tmp_path: Path) -> None:
     world = World(load(), tmp_path)
-    left = world.ledgers()[0]
+    left = world.arm_studies()[0]
     asked = [left.ask() for _ in range(3)]
     assert asked[0] is not None
     left.complete(asked[0], [1.0, 2.0])
-    assert world.ledgers()[0].take_up() == 2
-    assert [ledger.take_up() for ledger in world.ledgers()] == [0, 0]
+    assert world.arm_studies()[0].take_up() == 2
+    assert [arm_study.take_up() for arm_study in world.arm_studies()] == [0, 0]
 
 
 def test_a_stopped_search_saves_itself_and_continues(tmp_path: Path) -> None:
@@ -626,7 +627,7 @@ def test_a_stopped_search_saves_itself_and_continues(tmp_path: Path) -> None:
     (tmp_path / "stop").unlink()
     trained = world.launch(size=2).trained
     assert trained == 40 - 11  # no point is trained twice
-    assert [ledger.counts()["complete"] for ledger in world.ledgers()] == [5, 5]
+    assert [arm_study.counts()["complete"] for arm_study in world.arm_studies()] == [5, 5]
     assert {run.status for run in world.shelf} == {"finished"}
     assert all([p["step"] for p in points_of(run.values)] == [0, 200, 400, 600] for run in world.shelf)
 
@@ -639,28 +640,28 @@ def test_the_winner_says_where_it_comes_from_and_a_study_includes_it(tmp_path: P
     world = World(search, tmp_path)
     world.launch()
     tracker = MemoryTracker(search_card(search), world.shelf)
-    written = results(search, world.ledgers(), tracker, Home(tmp_path), Path("studies/found"))
+    written = results(search, world.arm_studies(), tracker, Home(tmp_path), Path("studies/best_params"))
     assert [str(file) for file in written.winners] == [
-        "studies/found/search_x.iql.quick.yaml",
-        "studies/found/search_x.vdn.quick.yaml",
+        "studies/best_params/search_x.iql.quick.yaml",
+        "studies/best_params/search_x.vdn.quick.yaml",
     ]
     assert set(tracker.files) == {file.name for file in (*written.winners, *written.plots)}
     assert {"iql.history.png", "vdn.importance.png"} <= set(tracker.files)
     document = YAML(typ="safe").load(written.winners[0])
-    said, best = document["provenance"], world.ledgers()[0].best()
+    said, best = document["provenance"], world.arm_studies()[0].best()
     assert best is not None
     assert said["search"] == "search_x.yaml"
     assert said["sha256"] == search.sha256
     assert said["trials"] == {"budget": 5, "complete": 5, "pruned": 0, "failed": 0}
     assert (said["steps"], said["fingerprint"], said["profile"]) == (600, CODE, "quick")
     assert said["best"]["value"] == best.value == pytest.approx(sum(said["best"]["seeds"].values()) / 2)
-    assert said["best"]["found"] == best.params
+    assert said["best"]["params"] == best.params
     assert list(said["best"]["seeds"]) == search.seed_list()
     assert str(tmp_path) not in written.winners[0].read_text()
     Path("studies/use.yaml").write_text(
-        "question: Which?\nbase: {env: {kind: coverage}, algo: {include: found/search_x.iql.quick.yaml}}\n"
+        "question: Which?\nbase: {env: {kind: coverage}, algo: {include: best_params/search_x.iql.quick.yaml}}\n"
         "arms:\n  found: {}\n  more: {algo: {hidden_dim: 32}}\n"
-        "  VDN: {algo: {include: found/search_x.vdn.quick.yaml, gamma: 0.5}}\nseeds: 1\nsteps: 100\n"
+        "  VDN: {algo: {include: best_params/search_x.vdn.quick.yaml, gamma: 0.5}}\nseeds: 1\nsteps: 100\n"
     )
     arms = Study.load("studies/use.yaml").arms
     assert arms["found"].algo == search.arms["IQL"].at(best.params).algo
@@ -678,7 +679,7 @@ def test_names_of_arms_become_names_of_files() -> None:
 def test_no_plot_without_trials_for_it(tmp_path: Path) -> None:
     search = load(GOOD, "quick", "trials=1")
     world = World(search, tmp_path)
-    (iql, _) = world.ledgers()
+    (iql, _) = world.arm_studies()
     assert plots(iql.study, "x", tmp_path / "iql") == []
     world.launch()
     assert [file.name for file in plots(iql.study, "x", tmp_path / "iql")] == ["iql.history.png"]
@@ -690,7 +691,7 @@ def test_no_plot_without_trials_for_it(tmp_path: Path) -> None:
 def test_a_dimension_is_offered_whole_or_not(tmp_path: Path) -> None:
     world = World(load(), tmp_path)
     world.launch()
-    (_, vdn) = world.ledgers()
+    (_, vdn) = world.arm_studies()
     for trial in vdn.latest().values():
         assert isinstance(trial.params["batch_size"], int)
         assert 16 <= trial.params["batch_size"] <= 32
@@ -735,10 +736,10 @@ def test_trials_of_other_code_are_stale(tmp_path: Path) -> None:
     world.launch()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pipelines.specs.search.code_id", lambda *place: "0ther")
-        ledger, stale = look(world.search, "IQL", world.storage)
-    assert (ledger.closed, stale) == (0, 5)
-    ledger, stale = look(world.search, "IQL", world.storage)
-    assert (ledger.closed, stale) == (5, 0)
+        arm_study, stale = look(world.search, "IQL", world.storage)
+    assert (arm_study.closed, stale) == (0, 5)
+    arm_study, stale = look(world.search, "IQL", world.storage)
+    assert (arm_study.closed, stale) == (5, 0)
 
 
 # The command
@@ -806,7 +807,7 @@ def test_a_killed_and_interrupted_search_ends_as_one_that_was_not(
     shutil.copy(home / "mlflow.db", project / "template.db")
     with pytest.MonkeyPatch.context() as alone:  # without Ray: a worker takes seconds to start, and changes nothing
         alone.setattr(ray_driver, "ray_session", lambda *args: nullcontext([]))
-        alone.setattr(pool, "Pool", PoolHere)
+        alone.setattr(ray_workers, "Pool", PoolHere)
         assert run_search(search, fresh(project, "whole"), project / "whole" / "out") == 0
     capsys.readouterr()
 

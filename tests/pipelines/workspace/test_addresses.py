@@ -195,7 +195,7 @@ def test_no_verb_gives_a_password_away(
 
 
 def no_secret(said: str | bytes) -> bool:
-    """Whether neither form of the password, nor a telling part of one, is there."""
+    """True if neither form of the password, nor a telling part of one, is there."""
     text = said if isinstance(said, str) else said.decode(errors="replace")
     return not any(form in text for form in (RAW, CODED, repr(RAW)[1:-1], "cr'et", "cr%27et"))
 

@@ -1,4 +1,4 @@
-"""What is only looked at never ends a launch, and shows names as they were typed."""
+"""Output that is only looked at never ends a launch, and shows names as they were typed."""
 
 import io
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from pipelines.tuning import search_run
 from pipelines.workspace.best_effort import WHY_NOT, decoration
 from pipelines.workspace.terminal import terminal
 from pipelines.workspace.work_folder import Home, StoreError
-from reports.data import escaping as escape
+from reports.data import escaping
 from tests.pipelines.support import plan, setting, tiny
 from tests.reports.hostile import NAMES, QUESTION, csv_words, markdown_words
 
@@ -229,7 +229,7 @@ def test_what_is_known_so_far_shows_names_as_typed() -> None:
 def test_the_table_in_the_log_has_no_formulas(tmp_path: Path) -> None:
     (tmp_path / "finals.csv").write_text(table(runs()), encoding="utf-8")
     _, *rows = csv_words(tmp_path / "finals.csv")
-    assert [escape.typed(row[0]) for row in rows] == list(NAMES)
+    assert [escaping.typed(row[0]) for row in rows] == list(NAMES)
     assert [row[0] for row in rows if row[0][0] in "=+-@"] == []
 
 

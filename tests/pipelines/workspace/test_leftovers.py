@@ -1,4 +1,4 @@
-"""What a killed process leaves is swept by the next that does the same; what a living one uses is left alone."""
+"""Files of a killed process are swept by the next that does the same; files of a living one are left alone."""
 
 import os
 import signal
@@ -12,7 +12,7 @@ import pytest
 
 from pipelines.tracking.mlflow_tracker import create_database
 from pipelines.tuning import trials
-from pipelines.workspace import leftovers as litter
+from pipelines.workspace import leftovers
 from pipelines.workspace.leftovers import HOST, claim, dead, part_of, scratch, sweep_claimed, sweep_scratch
 from pipelines.workspace.work_folder import Home, StoreError, whole
 
@@ -111,7 +111,7 @@ def test_a_process_killed_in_its_scratch_leaves_it_to_the_next(temporary: Path) 
 def test_claimed_folders(tmp_path: Path, living: int, gone: int, monkeypatch: pytest.MonkeyPatch) -> None:
     for number in (living, gone):
         (tmp_path / f"ray-{number}").mkdir()
-        monkeypatch.setattr(litter, "owner", lambda number=number: f"{HOST}-{number}")
+        monkeypatch.setattr(leftovers, "owner", lambda number=number: f"{HOST}-{number}")
         claim(tmp_path / f"ray-{number}")
     (tmp_path / "ray-other").mkdir()
     sweep_claimed(tmp_path, "ray-*")

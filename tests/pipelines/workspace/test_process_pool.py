@@ -51,7 +51,7 @@ def faulty(item: Exception | int) -> int:
 
 
 def shared(tensor: torch.Tensor) -> tuple[bool, torch.Tensor]:
-    """Whether the tensor came in shared memory, and the next one."""
+    """True if the tensor came in shared memory, and the next one."""
     return tensor.is_shared(), tensor + 1
 
 

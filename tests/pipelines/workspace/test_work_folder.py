@@ -24,9 +24,8 @@ from pipelines.tracking.mlflow_tracker import MlflowTracker, fetch, open_existin
 from pipelines.tracking.plan import items, study_card
 from pipelines.tracking.policy import FILE, Saved, load, save
 from pipelines.tuning.search_run import show_search
-from pipelines.tuning.trials import Ledger, look, open_storage, opened
-from pipelines.workspace import relocation as moved
-from pipelines.workspace import sqlite
+from pipelines.tuning.trials import ArmStudy, look, open_storage, opened
+from pipelines.workspace import relocation, sqlite
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.work_folder import Home, StoreError, work_folder
 from rhmc.training.trainer import Trainer, grid_step
@@ -89,7 +88,7 @@ def stored(home: Path) -> set[str]:
     with closing(sqlite3.connect(home / "mlflow.db")) as database:
         asked = [
             database.execute(f"SELECT {column} FROM {table}").fetchall()
-            for table, column in moved.LOCATED
+            for table, column in relocation.LOCATED
             if table != "experiments"
         ]
         asked.append(database.execute("SELECT artifact_location FROM experiments WHERE experiment_id > 0").fetchall())
@@ -133,7 +132,7 @@ def test_what_is_written_goes_to_where_the_folder_is(put: object, old: Path, tmp
     uri = sqlite.address(new / "mlflow.db")
     client = mlflow.MlflowClient(uri, uri)
     for version in client.search_model_versions():
-        place = moved.folder(client.get_model_version_download_uri(version.name, version.version))
+        place = relocation.folder(client.get_model_version_download_uri(version.name, version.version))
         assert place is not None
         assert (place / "MLmodel").is_file()
         assert place.is_relative_to(new)
@@ -211,7 +210,7 @@ def test_an_address_is_the_way_to_a_file_and_back(name: str) -> None:
         assert sqlite.sqlite_file(address) == path
         assert make_url(address).render_as_string(hide_password=False) == address
         assert address.isascii() or not name.isascii()
-    assert moved.folder(path.as_uri()) == path
+    assert relocation.folder(path.as_uri()) == path
 
 
 @given(st.text(st.sampled_from("#?%2F '\"~{}&=+;:@\\\n\tä"), min_size=1, max_size=20))
@@ -326,7 +325,7 @@ def searched(home: Path) -> Search:
     search = Search.load(home.parent / "search_x.yaml", "quick", [])
     with opened(Home(home)) as storage:
         assert storage is not None
-        assert Ledger(search, "one", storage).ask() is not None
+        assert ArmStudy(search, "one", storage).ask() is not None
     return search
 
 

@@ -11,7 +11,7 @@ from reports.analyses import beyond
 from reports.data.frame import Results, TableError, load
 from tests.reports.factory import (
     COVERAGE,
-    SCRIPTED,
+    YARDSTICK_RETURNS,
     Tables,
     assignments,
     noisy,
@@ -121,7 +121,7 @@ def test_transfer_is_the_mean_over_seeds(tmp_path: Path) -> None:
     assert rows.loc[("RHMC", 6, 5), "value"] == 81.0  # seeds 80, 81, 82
     assert (rows.loc[("RHMC", 6, 5), "low"], rows.loc[("RHMC", 6, 5), "high"]) == (80, 82)
     assert rows.loc[("best_window", 6, 5), "value"] == 78.0
-    assert rows.loc[("planner", 4, 5), "value"] == SCRIPTED["planner"]
+    assert rows.loc[("planner", 4, 5), "value"] == YARDSTICK_RETURNS["planner"]
     shown = table.shown.set_index("Arm")
     assert list(shown.columns) == ["2 x 5", "4 x 3", "4 x 5", "6 x 5"]
     assert shown.loc["IQL", "2 x 5"] == "–"  # not played, and no zero

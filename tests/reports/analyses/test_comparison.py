@@ -125,9 +125,9 @@ def test_the_matrix_is_of_wins(results: Results) -> None:
 
 
 @pytest.mark.usefixtures("quick_resampling")
-def test_efficiency_is_to_the_scripted_level(results: Results) -> None:
+def test_efficiency_is_to_the_level_of_a_yardstick(results: Results) -> None:
     level = comparison.reference(results, "coverage")
-    assert level == (65.3, "what the scripted policy best window gets")
+    assert level == (65.3, "the score of the yardstick best window")
     table = comparison.efficiency(results, "coverage")
     assert table is not None
     rows = table.numbers.set_index("arm")
@@ -158,7 +158,7 @@ def test_time_is_shown_where_it_is_known_of_every_seed(results: Results) -> None
     assert known.to_dict() == {"RHMC": False, "QMIX": True, "IQL": False, "VDN": False}
 
 
-def test_without_a_scripted_level_the_best_arm_gives_it(tmp_path: Path) -> None:
+def test_without_a_yardstick_the_best_arm_gives_it(tmp_path: Path) -> None:
     found = load(write(tmp_path, study("coverage", {"RHMC": noisy(70)})), "quick")
     assert comparison.reference(found, "coverage") == (pytest.approx(63.0), "90 % of the best arm's mean final return")
     low = load(write(tmp_path / "low", study("navigation", {"RHMC": noisy(-30)}, env=NAVIGATION)), "quick")

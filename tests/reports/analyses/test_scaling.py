@@ -59,11 +59,11 @@ def test_an_arm_without_its_number(arm: str, name: str) -> None:
 
 def test_the_figure_has_every_number_and_the_yardsticks_of_each(tmp_path: Path) -> None:
     two, four = ({"best_window": 50.0}, COVERAGE | {"agents": 2}), ({"best_window": 65.3}, COVERAGE)
-    rulers = [yardsticks(*pair) for pair in (two, four)]
-    points, runs = (pd.concat(x, ignore_index=True) for x in zip(*rulers, strict=True))
-    config = [text for _, plan in rulers for text in plan["config"]]
+    sizes = [yardsticks(*pair) for pair in (two, four)]
+    points, runs = (pd.concat(x, ignore_index=True) for x in zip(*sizes, strict=True))
+    config = [text for _, plan in sizes for text in plan["config"]]
     ids = {"run": [f"y{n}" for n in range(2)]}
-    points["run"] = ["y0"] * len(rulers[0][0]) + ["y1"] * len(rulers[1][0])
+    points["run"] = ["y0"] * len(sizes[0][0]) + ["y1"] * len(sizes[1][0])
     results = read_in(tmp_path, tables(LEVELS), (points, runs.assign(config=config, **ids)))
     found = scaling.sweep(results)
     assert found is not None

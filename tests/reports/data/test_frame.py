@@ -1,4 +1,4 @@
-"""What is wrong in a table is said in one line; what is not there yet is missing, never zero."""
+"""A fault in a table is reported in one line; values that are not there yet are missing, never zero."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -206,7 +206,7 @@ def test_unfinished_is_missing_and_not_zero(tmp_path: Path) -> None:
         "Study `ablation`, arm full: 1 of 3 seeds unfinished (seed 1).",
         "Study `ablation`, arm no filter: 1 of 3 seeds not run (seed 2).",
         "Study `ablation`: no such arm yet: no regulation.",
-        "Study `ablation`: no scripted policies were run on this task.",
+        "Study `ablation`: no yardsticks were run on this task.",
         "Study `coverage`: no results.",
     ]
 
@@ -226,7 +226,7 @@ def test_yardsticks_belong_to_their_task(tmp_path: Path) -> None:
     folder = write(tmp_path, study("coverage", {"RHMC": [70.0, 71.0]}), (tables[0], tables[1]))
     results = load(folder, "quick")
     found = results.yardsticks_of("coverage")["final/return"]
-    assert found.to_dict() == factory.SCRIPTED
+    assert found.to_dict() == factory.YARDSTICK_RETURNS
     assert results.yardsticks_of("navigation").empty  # no such study
     results = load(write(tmp_path / "six", study("coverage", {"RHMC": [70.0, 71.0]}), six), "quick")
     assert results.yardsticks_of("coverage").empty

@@ -50,7 +50,7 @@ setTimeout(() => {
 
 
 class Seen(NamedTuple):
-    """What the probe found, and what stood on the console."""
+    """The findings of the probe, and the console's text."""
 
     found: dict[str, Any]
     console: list[str]

@@ -1,4 +1,4 @@
-"""What the README shows is what the report wrote."""
+"""The README's tables equal the report's."""
 
 import re
 from pathlib import Path

@@ -8,25 +8,17 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch import Generator, Tensor, nn
+from torch import Tensor, nn
 
 from rhmc.algorithms.coma import COMA, Config, draw, expected
 from rhmc.learning.experience import flat
 from rhmc.learning.learner import taken
-from rhmc.types import Batch, Local, Obs, Spec, Transition
+from rhmc.types import Batch, Local, Spec, Transition
 from tests.conformance import assert_same
+from tests.support import constant, observation, seeded
 
 SPEC = Spec(2, 3, agent_features=1, pair_features=4, peer_features=0, actions=3, continuous=False, episode=9)
 N, M, ACTIONS = SPEC.agents, SPEC.targets, SPEC.actions
-
-
-def seeded(seed: int = 0) -> Generator:
-    return Generator().manual_seed(seed)
-
-
-@pytest.fixture(autouse=True)
-def _seed() -> None:
-    torch.manual_seed(0)
 
 
 def method(**changes: Any) -> COMA:
@@ -39,21 +31,6 @@ def method(**changes: Any) -> COMA:
         "epsilon": 0.0,
     }
     return COMA(Config(**plain | {"gamma": 0.5, "td_lambda": 0.5, "ent_coef": 0.0} | changes), SPEC, 2, seeded())
-
-
-def observation(batch: int = 1) -> Obs:
-    pairs, agents = torch.randn(batch, N, M, 4), torch.randn(batch, N, 1)
-    return Obs(agents, pairs, torch.zeros(batch, N, N, 0), torch.zeros(batch, dtype=torch.bool))
-
-
-def constant(net: nn.Module, out: list[float]) -> Tensor:
-    """Makes a network return `out` whatever it sees; returns the weights that say so."""
-    weights = list(net.parameters())
-    with torch.no_grad():
-        for p in weights:
-            p.zero_()
-        weights[-1].copy_(torch.tensor(out))
-    return weights[-1]
 
 
 def others_action(net: nn.Module, times: float) -> None:
@@ -73,7 +50,7 @@ def transition(
     """One step of as many environments as there are joint actions."""
     b = len(action)
     flag = torch.ones(b, dtype=torch.bool)
-    obs = observation(b)
+    obs = observation(SPEC, b)
     _, _, extra = algo.act(obs, {}, seeded(), explore=True)
     t = Transition(
         obs,
@@ -83,7 +60,7 @@ def transition(
         torch.zeros(b, N, M, dtype=torch.bool),
         flag & (after == "over"),
         flag & (after == "cut"),
-        observation(b),
+        observation(SPEC, b),
         lambda horizon: torch.zeros(0),
         extra,
     )
@@ -170,7 +147,7 @@ def test_scaled_advantages_have_mean_0_and_deviation_1_and_keep_their_order(wort
 @pytest.mark.parametrize("share", [True, False])
 @pytest.mark.parametrize("encoder", ["mlp", "pairwise"])
 def test_an_agents_action_values_see_the_others_actions_and_not_its_own(encoder: str, share: bool) -> None:
-    algo, obs = method(encoder=encoder, share=share), observation(6)
+    algo, obs = method(encoder=encoder, share=share), observation(SPEC, 6)
     action = torch.randint(ACTIONS, (6, N), generator=seeded())
     q = algo.critic.net(obs, joint=algo._joint(action))
     assert q.shape == (6, N, ACTIONS)
@@ -327,7 +304,7 @@ def test_a_certain_policy_has_finite_gradients() -> None:
 
 @pytest.mark.parametrize(("epsilon", "floor"), [(0.6, 0.2), (0.3, 0.1), (0.0, 0.0)])
 def test_no_action_is_less_likely_than_its_share_of_epsilon(epsilon: float, floor: float) -> None:
-    algo, obs = method(epsilon=epsilon), observation()
+    algo, obs = method(epsilon=epsilon), observation(SPEC)
     constant(algo.actor.net, [0.0, 500.0, 0.0])
     _, _, extra = algo.act(obs, {}, seeded(), explore=True)
     assert extra["chance"][0, 0].tolist() == pytest.approx([floor, 1 - 2 * floor, floor])
@@ -335,7 +312,7 @@ def test_no_action_is_less_likely_than_its_share_of_epsilon(epsilon: float, floo
 
 
 def test_actions_are_those_whose_chances_are_told() -> None:
-    algo, obs = method(epsilon=0.6), observation(4000)
+    algo, obs = method(epsilon=0.6), observation(SPEC, 4000)
     constant(algo.actor.net, [0.0, 500.0, 0.0])
     action, _, _ = algo.act(obs, {}, seeded(), explore=True)
     assert (action.flatten().bincount() / 8000).tolist() == pytest.approx([0.2, 0.6, 0.2], abs=0.03)

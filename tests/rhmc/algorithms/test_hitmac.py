@@ -1,6 +1,5 @@
 """HiT-MAC: the critic's sum and the policy's probabilities by hand, what a decision earns, and the two phases."""
 
-import io
 from itertools import pairwise, product
 from typing import Any
 
@@ -21,18 +20,11 @@ from rhmc.training.trainer import Trainer
 from rhmc.types import Batch, Local, Obs, Spec, Transition
 from tests.blocks import nested
 from tests.conformance import DifferentError, assert_same
+from tests.support import observation, seeded, through_a_file
 
+pytestmark = pytest.mark.usefixtures("short_episodes")
 SPEC = Spec(2, 3, agent_features=0, pair_features=4, peer_features=0, actions=3, continuous=False, episode=7)
 N, M = SPEC.agents, SPEC.targets
-
-
-def seeded(seed: int = 0) -> Generator:
-    return Generator().manual_seed(seed)
-
-
-@pytest.fixture(autouse=True)
-def _seed() -> None:
-    torch.manual_seed(0)
 
 
 OWN = {name: f"coordinator.{name}" for name in Settings.model_fields}
@@ -46,23 +38,11 @@ def config(**changes: Any) -> Config:
     return Config(**nested(settings | {OWN.get(name, name): value for name, value in own.items()}))
 
 
-def observation(batch: int, first: bool = False) -> Obs:
-    pairs, agents = torch.randn(batch, N, M, 4), torch.zeros(batch, N, 0)
-    return Obs(agents, pairs, torch.zeros(batch, N, N, 0), torch.full((batch,), first))
-
-
-def through_a_file(state: Any) -> Any:
-    file = io.BytesIO()
-    torch.save(state, file)
-    file.seek(0)
-    return torch.load(file, weights_only=True)
-
-
 # The critic: a sum of marginal contributions
 
 
 class Product(nn.Module):
-    """What a pair adds, made easy: its own number times the mean of those before it, plus its own number."""
+    """The contribution of a pair, made easy: its own number times the mean of those before it, plus its own number."""
 
     def forward(self, both: Tensor) -> Tensor:
         before, own = both.chunk(2, -1)
@@ -96,14 +76,14 @@ def test_renumbering_the_pairs_and_their_order_alike_changes_nothing(
 
 
 def test_another_order_is_another_sum() -> None:
-    critic, obs = Contributions("mlp", Sizes.of(SPEC), 8), observation(1)
+    critic, obs = Contributions("mlp", Sizes.of(SPEC), 8), observation(SPEC, 1)
     sums = {round(critic(obs, orders(1, 6, seeded(k))).item(), 6) for k in range(20)}
     assert len(sums) > 10
 
 
 @pytest.mark.parametrize("encoder", ["mlp", "pairwise"])
 def test_the_value_is_the_sum_of_the_contributions_of_all_pairs(encoder: Any) -> None:
-    critic, obs, order = Contributions(encoder, Sizes.of(SPEC), 8), observation(7), orders(7, 6, seeded())
+    critic, obs, order = Contributions(encoder, Sizes.of(SPEC), 8), observation(SPEC, 7), orders(7, 6, seeded())
     each = critic.each(critic.body(obs), order)
     assert each.shape == (7, 6)
     assert torch.allclose(critic(obs, order), each.sum(1))
@@ -126,7 +106,7 @@ def test_the_first_pairs_context_is_nothing() -> None:
 
 
 def test_every_pair_attends_to_every_other() -> None:
-    actor, obs = Assigner("pairwise", Sizes.of(SPEC), 8), observation(1)
+    actor, obs = Assigner("pairwise", Sizes.of(SPEC), 8), observation(SPEC, 1)
     # The encoder pools over rows and columns: (0, 0) and (1, 1) share neither.
     changed = obs.pairs.clone()
     changed[0, 1, 1] += 1
@@ -136,7 +116,7 @@ def test_every_pair_attends_to_every_other() -> None:
 
 
 def test_reordering_agents_and_targets_reorders_the_logits() -> None:
-    actor, obs = Assigner("pairwise", Sizes.of(SPEC), 8), observation(9)
+    actor, obs = Assigner("pairwise", Sizes.of(SPEC), 8), observation(SPEC, 9)
     moved = obs._replace(agents=obs.agents[:, [1, 0]], pairs=obs.pairs[:, [1, 0]][:, :, [2, 0, 1]])
     assert torch.allclose(actor(moved), actor(obs)[:, [1, 0]][:, :, [2, 0, 1]], atol=1e-6)
 
@@ -166,7 +146,7 @@ def test_the_likelihoods_of_all_assignments_add_up_to_one(logits: list[float]) -
 
 
 def test_assignments_are_drawn_with_the_chances_that_are_said() -> None:
-    algo, obs = HiTMAC(config(), SPEC, 4, seeded()), observation(1, first=True)
+    algo, obs = HiTMAC(config(), SPEC, 4, seeded()), observation(SPEC, 1, first=True)
     many = Obs(*(x.expand(5000, *x.shape[1:]) for x in obs))
     _, _, extra = algo.act(many, algo.carry(5000), seeded(), explore=True)
     chance = torch.where(extra["assignment"] > 0, extra["chance"], 0.0).exp()
@@ -194,10 +174,10 @@ def step(
 
 def play(algo: HiTMAC, rewards: list[float], batch: int = 1, **last: bool) -> list[Obs]:
     """One episode of all environments; returns what was seen before each step and after the last."""
-    seen, carry = [observation(batch, first=True)], algo.carry(batch)
+    seen, carry = [observation(SPEC, batch, first=True)], algo.carry(batch)
     for k, reward in enumerate(rewards):
         _, carry, extra = algo.act(seen[-1], carry, seeded(k), explore=True)
-        seen.append(observation(batch))
+        seen.append(observation(SPEC, batch))
         flags = last if k == len(rewards) - 1 else {}
         algo.observe(step(seen[-2], extra, reward, seen[-1], **flags))
     return seen
@@ -273,7 +253,7 @@ def test_environments_that_are_out_of_step_keep_their_own_decisions() -> None:
 
 def test_out_of_step_decisions_bootstrap_from_their_own_successors() -> None:
     algo = HiTMAC(config(n_steps=2), SPEC, 2, seeded())
-    seen, after = observation(2), observation(2)
+    seen, after = observation(SPEC, 2), observation(SPEC, 2)
     common = {"assignment": torch.zeros(2, N, M), "chance": torch.zeros(2, N, M), "length": torch.full((2,), 3.0)}
     flags = {"terminated": torch.zeros(2).bool(), "done": torch.zeros(2).bool(), "reward": torch.zeros(2)}
     rows = common | flags | pack(seen) | pack(after, "next_")
@@ -304,7 +284,7 @@ def test_an_assignment_is_held_for_its_period_and_never_across_episodes() -> Non
 
 
 def test_evaluation_is_the_threshold_at_one_half() -> None:
-    algo, obs = HiTMAC(config(), SPEC, 50, seeded()), observation(50, first=True)
+    algo, obs = HiTMAC(config(), SPEC, 50, seeded()), observation(SPEC, 50, first=True)
     algo.coordinator.actor.net.head.bias.data -= algo.coordinator.actor.net(obs).median()
     _, _, extra = algo.act(obs, algo.carry(50), seeded(), explore=False)
     assert torch.equal(extra["assignment"], (algo.coordinator.actor.net(obs).sigmoid() > 0.5).float())
@@ -313,7 +293,7 @@ def test_evaluation_is_the_threshold_at_one_half() -> None:
 
 def decided(algo: HiTMAC, advantage: float) -> Batch:
     """Rows as `improve` gets them, of decisions by the policy as it is."""
-    obs = observation(32, first=True)
+    obs = observation(SPEC, 32, first=True)
     _, _, extra = algo.act(obs, algo.carry(32), seeded(), explore=True)
     wanted = {"advantage": torch.full((32,), advantage), "target": torch.zeros(32)}
     return pack(obs) | {key: extra[key] for key in ("assignment", "chance")} | wanted
@@ -353,11 +333,6 @@ def coverage_task() -> coverage.Config:
     return coverage.Config(agents=N, targets=M)
 
 
-@pytest.fixture(autouse=True)
-def _short_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(coverage.PRESETS, "flat", coverage.PRESETS["flat"]._replace(episode=7))
-
-
 def test_practice_covers_every_number_of_targets_alike() -> None:
     drawn = practice(torch.ones(8000).bool(), torch.zeros(8000, N, M), seeded())
     assert set(drawn.unique().tolist()) == {0.0, 1.0}
@@ -368,7 +343,7 @@ def test_practice_covers_every_number_of_targets_alike() -> None:
 
 def test_practice_assignments_last_ten_steps_on_average() -> None:
     algo, batch = HiTMAC(config(pretrain=10**9), SPEC, 4, seeded()), 500
-    obs, carry, rng, changes = observation(batch), algo.carry(batch), seeded(), 0
+    obs, carry, rng, changes = observation(SPEC, batch), algo.carry(batch), seeded(), 0
     for _ in range(40):
         before = carry["assignment"]
         _, carry, _ = algo.act(obs, carry, rng, explore=True)
@@ -403,7 +378,7 @@ def test_executors_learn_first_and_are_frozen_then() -> None:
 
 
 def test_frozen_executors_act_greedily_for_the_coordinator() -> None:
-    algo, obs = HiTMAC(config(), SPEC, 4, seeded()), observation(200, first=True)
+    algo, obs = HiTMAC(config(), SPEC, 4, seeded()), observation(SPEC, 200, first=True)
     action, _, extra = algo.act(obs, algo.carry(200), seeded(), explore=True)
     assert torch.equal(action, algo.executor.act(obs, extra["assignment"], seeded(5), explore=False))
 

@@ -5,18 +5,18 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Generator, Size, Tensor, nn
+from torch import Size, Tensor, nn
 
 from rhmc.algorithms.maddpg import MADDPG, Config
 from rhmc.envs import make_env, navigation
 from rhmc.envs.base import Env
-from rhmc.learning.learner import pack
 from rhmc.networks.heads import Choices, Continuous, Discrete
 from rhmc.networks.sampling import gumbel, straight_through
 from rhmc.training.trainer import Config as Run
 from rhmc.training.trainer import Trainer
 from rhmc.types import Batch, Obs, Spec
 from tests.conformance import assert_same
+from tests.support import observation, observed, seeded
 
 N, A = 3, 2
 SPEC = Spec(N, 2, agent_features=1, pair_features=4, peer_features=2, actions=A, continuous=False, episode=9)
@@ -27,30 +27,16 @@ either = pytest.mark.parametrize("continuous", [False, True], ids=["discrete", "
 both = pytest.mark.parametrize("encoder", ["mlp", "pairwise"])
 
 
-def seeded(seed: int = 0) -> Generator:
-    return Generator().manual_seed(seed)
-
-
-@pytest.fixture(autouse=True)
-def _seed() -> None:
-    torch.manual_seed(0)
-
-
 def method(continuous: bool = False, **changes: Any) -> MADDPG:
     return MADDPG(
         Config(**SMALL | {"standardise": "none"} | changes), SPEC._replace(continuous=continuous), 4, seeded()
     )
 
 
-def observation(batch: int) -> Obs:
-    pairs, peers = torch.randn(batch, N, 2, 4), torch.randn(batch, N, N, 2)
-    return Obs(torch.randn(batch, N, 1), pairs, peers, torch.zeros(batch, dtype=torch.bool))
-
-
 def rows(continuous: bool, batch: int = 5, terminated: bool = False) -> Batch:
     action = torch.rand(batch, N, A) * 2 - 1 if continuous else torch.randint(A, (batch, N))
     out = {"action": action, "reward": torch.randn(batch), "terminated": torch.full((batch,), terminated)}
-    return out | pack(observation(batch)) | pack(observation(batch), "next_")
+    return out | observed(SPEC, batch)
 
 
 class Actor(nn.Module):
@@ -142,11 +128,11 @@ class Table(nn.Module):
 def test_the_slope_in_a_discrete_action_is_the_difference_that_another_one_makes() -> None:
     critic, joint = Choices(Table()), torch.eye(A)[torch.randint(A, (6, N))]
     own = torch.eye(A)[torch.randint(A, (6, N))].requires_grad_()
-    value = critic(observation(6), own=own, joint=joint)
+    value = critic(observation(SPEC, 6), own=own, joint=joint)
     assert value.shape == (6, N, 1)
     slope = torch.autograd.grad(value.sum(), own)[0]
     for choice in range(A):
-        other = critic(observation(6), own=torch.eye(A)[choice].expand(6, N, A), joint=joint)
+        other = critic(observation(SPEC, 6), own=torch.eye(A)[choice].expand(6, N, A), joint=joint)
         change = (slope * (torch.eye(A)[choice] - own)).sum(-1, keepdim=True)
         assert torch.allclose(other - value, change, atol=1e-4)
 
@@ -154,7 +140,7 @@ def test_the_slope_in_a_discrete_action_is_the_difference_that_another_one_makes
 @both
 @either
 def test_a_critic_takes_the_own_action_and_the_others(encoder: str, continuous: bool) -> None:
-    algo, obs = method(continuous, encoder=encoder), observation(5)
+    algo, obs = method(continuous, encoder=encoder), observation(SPEC, 5)
     own, joint = torch.rand(5, N, A), torch.rand(5, N, A)
     value = algo.critic.net(obs, own=own, joint=joint)
     assert value.shape == (5, N, 1)

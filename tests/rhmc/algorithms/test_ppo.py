@@ -8,25 +8,17 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch import Generator, Tensor, nn
+from torch import Tensor, nn
 
 from rhmc.algorithms import ALGORITHMS, ppo
 from rhmc.algorithms.ppo import PPO, Clip, Config, Penalty
 from rhmc.networks.nets import ENCODERS, Sizes, Unshared
 from rhmc.types import Local, Obs, Spec, Transition
+from tests.support import constant, observation, seeded
 
 SPEC = Spec(2, 3, agent_features=1, pair_features=2, peer_features=1, actions=3, continuous=False, episode=9)
 N, M, A = SPEC.agents, SPEC.targets, SPEC.actions
 CPU = torch.device("cpu")
-
-
-@pytest.fixture(autouse=True)
-def _seed() -> None:
-    torch.manual_seed(0)
-
-
-def seeded(seed: int = 0) -> Generator:
-    return Generator().manual_seed(seed)
 
 
 def config(**changes: Any) -> Config:
@@ -37,31 +29,17 @@ def method(sees: Literal["local", "central"] = "central", **changes: Any) -> PPO
     return PPO(config(**changes), SPEC, seeded(), sees)
 
 
-def observation(batch: int = 1) -> Obs:
-    first = torch.zeros(batch, dtype=torch.bool)
-    return Obs(torch.randn(batch, N, 1), torch.randn(batch, N, M, 2), torch.randn(batch, N, N, 1), first)
-
-
 def acted(algo: PPO, reward: Tensor, obs: Obs | None = None, **changes: Any) -> Transition:
     """One acted step of as many environments as there are rewards."""
     batch = len(reward)
-    obs = observation(batch) if obs is None else obs
+    obs = observation(SPEC, batch) if obs is None else obs
     with torch.no_grad():
         action, _, extra = algo.act(obs, {}, seeded(), explore=True)
     local, no = Local(torch.zeros(batch, N, M), torch.zeros(batch, N)), torch.zeros(batch, dtype=torch.bool)
     completed = torch.zeros(batch, N, M, dtype=torch.bool)
-    after = observation(batch)
+    after = observation(SPEC, batch)
     t = Transition(obs, action, reward, local, completed, no, no, after, lambda _: no, extra)
     return t._replace(**changes)
-
-
-def constant(net: nn.Module, out: list[float]) -> None:
-    """Makes a network return `out` whatever it sees."""
-    weights = list(net.parameters())
-    with torch.no_grad():
-        for p in weights:
-            p.zero_()
-        weights[-1].copy_(torch.tensor(out))
 
 
 def policies(*chances: list[float]) -> Tensor:
@@ -143,7 +121,7 @@ def test_the_price_is_set_after_every_rollout_and_kept_in_a_checkpoint(target: f
 
 def test_the_divergence_told_is_that_of_the_whole_rollouts_updates() -> None:
     algo = method(n_steps=1, epochs=4, minibatches=3, lr=0.05)
-    obs = observation(10)
+    obs = observation(SPEC, 10)
     with torch.no_grad():
         before = algo._policy(obs)
     algo.observe(acted(algo, torch.rand(10), obs))
@@ -160,7 +138,7 @@ def test_the_divergence_told_is_that_of_the_whole_rollouts_updates() -> None:
 def test_actions_are_drawn_from_the_policy_that_is_handed_out() -> None:
     algo = method()
     constant(algo.actor.net, [log(0.6) + 5, log(0.3) + 5, log(0.1) + 5])
-    obs = observation(5000)
+    obs = observation(SPEC, 5000)
     action, _, extra = algo.act(obs, {}, seeded(), explore=True)
     shares = action.flatten().bincount(minlength=A) / action.numel()
     assert torch.allclose(shares, torch.tensor([0.6, 0.3, 0.1]), atol=0.02)
@@ -181,7 +159,7 @@ def test_nothing_is_learned_before_a_rollout_is_full() -> None:
 
 
 def judged(monkeypatch: pytest.MonkeyPatch, algo: PPO) -> tuple[Tensor, Tensor, Tensor]:
-    """What an update hands to the objective as advantages, and to the critic's loss as values and targets."""
+    """Values that an update hands to the objective as advantages, and to the critic's loss as values and targets."""
     seen: list[Tensor] = []
     loss, objective = ppo.huber_loss, algo.objective
 
@@ -297,19 +275,19 @@ def test_the_first_update_starts_from_the_policy_that_acted(objective: str) -> N
 
 @pytest.mark.parametrize("entropy", [0.0, 0.1])
 def test_entropy_alone_makes_a_policy_uniform(entropy: float) -> None:
-    """Where no action is better than another, and only then with a weight."""
+    """The loss where no action is better than another, and only then with a weight."""
     algo = method(ent_coef=entropy, n_steps=1, epochs=20, lr=0.01)
     constant(algo.actor.net, [1.0, 0.0, 0.0])
     constant(algo.critic.net, [0.0])
-    before = algo._policy(observation()).exp().max()
+    before = algo._policy(observation(SPEC)).exp().max()
     algo.observe(acted(algo, torch.ones(4), terminated=torch.ones(4, dtype=torch.bool)))
     algo.update()
-    after = algo._policy(observation()).exp().max()
+    after = algo._policy(observation(SPEC)).exp().max()
     assert after < before - 0.05 if entropy else torch.equal(after, before)
 
 
 def test_the_critic_of_mappo_sees_the_others_and_that_of_ippo_does_not() -> None:
-    obs = observation()
+    obs = observation(SPEC)
     other = obs._replace(agents=obs.agents + torch.tensor([[[0.0], [1.0]]]))  # the second agent's
     for encoder, share in product(ENCODERS, (True, False)):
         mappo, ippo = (
@@ -331,12 +309,12 @@ def test_a_bandit_is_learned(objective: str) -> None:
     algo = method(objective=objective, n_steps=4, epochs=5, minibatches=2, lr=5e-3, kl_target=0.05)
     yes = torch.ones(32, dtype=torch.bool)
     for k in range(4 * 40):
-        obs = observation(32)
+        obs = observation(SPEC, 32)
         action, _, extra = algo.act(obs, {}, seeded(k), explore=True)
         reward = (action == torch.where(obs.agents.squeeze(-1) > 0, 1, 2)).float().mean(-1)
         algo.observe(acted(algo, reward, obs, action=action, extra=extra, terminated=yes))
         algo.update()
-    obs = observation(500)
+    obs = observation(SPEC, 500)
     best = torch.where(obs.agents.squeeze(-1) > 0, 1, 2)
     assert (algo.act(obs, {}, seeded(), explore=False)[0] == best).float().mean() > 0.95
 
@@ -363,15 +341,15 @@ def test_first_weights_are_orthogonal(encoder: Any, share: bool) -> None:
 
 @pytest.mark.parametrize("encoder", ENCODERS)
 def test_the_first_policy_is_nearly_uniform(encoder: Any) -> None:
-    chance = method(encoder=encoder)._policy(observation(100)).exp()
+    chance = method(encoder=encoder)._policy(observation(SPEC, 100)).exp()
     assert (chance - 1 / A).abs().max() < 0.03
     assert (chance - 1 / A).abs().max() > 0
 
 
 def test_the_last_layer_is_the_one_that_puts_out() -> None:
-    """What `orthogonal` takes for the last layer is so in every network that it is given."""
+    """The layer that `orthogonal` takes for the last is the last in every network that it is given."""
     sizes = Sizes.of(SPEC)
     for encoder in ENCODERS.values():
         for make in (encoder.local, encoder.central):
             net = ppo.orthogonal(make(sizes, 16, 3), 1e-6)
-            assert net(observation(10)).abs().max() < 1e-4
+            assert net(observation(SPEC, 10)).abs().max() < 1e-4

@@ -7,15 +7,15 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch import Generator, Tensor, nn
+from torch import Tensor, nn
 
 from rhmc.algorithms import ALGORITHMS
 from rhmc.algorithms.qlearning import QLearning
-from rhmc.learning.learner import pack
 from rhmc.learning.schedules import linear
 from rhmc.networks.nets import ENCODERS, Sizes, Unshared, mix, team
 from rhmc.types import Batch, Obs, Spec
 from tests.doubles import Known
+from tests.support import observation, observed, seeded
 
 SPEC = Spec(2, 3, agent_features=1, pair_features=4, peer_features=2, actions=3, continuous=False, episode=9)
 SIZES = Sizes.of(SPEC)
@@ -23,25 +23,11 @@ KINDS = ("iql", "vdn", "qmix")
 KEPT = 0.999  # of the running statistics
 
 
-def seeded(seed: int = 0) -> Generator:
-    return Generator().manual_seed(seed)
-
-
-@pytest.fixture(autouse=True)
-def _seed() -> None:
-    torch.manual_seed(0)
-
-
-def observation(batch: int, agents: int = 2, targets: int = 3) -> Obs:
-    pairs, own = torch.randn(batch, agents, targets, 4), torch.randn(batch, agents, 1)
-    return Obs(own, pairs, torch.randn(batch, agents, agents, 2), torch.zeros(batch, dtype=torch.bool))
-
-
 def rows(reward: list[float], terminated: list[bool], action: list[list[int]]) -> Batch:
     """A batch to learn from."""
     count = len(reward)
     known = {"reward": torch.tensor(reward), "terminated": torch.tensor(terminated), "action": torch.tensor(action)}
-    return known | pack(observation(count)) | pack(observation(count), "next_")
+    return known | observed(SPEC, count)
 
 
 NET = [[0.0, 1.0, 2.0], [3.0, 0.5, 0.0]]  # chooses actions 2 and 0
@@ -128,11 +114,11 @@ def test_epsilon_falls_in_a_line_and_stays() -> None:
 def test_exploring_is_by_the_epsilon_of_the_steps_taken(steps: int, epsilon: float) -> None:
     q = learner("vdn", epsilon_end=0.2, epsilon_steps=1000)
     q.experience.steps = steps
-    action, _, _ = q.act(observation(20_000), {}, seeded(), explore=True)
+    action, _, _ = q.act(observation(SPEC, 20_000), {}, seeded(), explore=True)
     greedy = torch.tensor([2, 0])
     share = (action == greedy).float().mean(0)
     assert share.tolist() == pytest.approx([1 - epsilon * 2 / 3] * 2, abs=0.015)
-    still, _, _ = q.act(observation(9), {}, seeded(), explore=False)
+    still, _, _ = q.act(observation(SPEC, 9), {}, seeded(), explore=False)
     assert (still == greedy).all()
 
 
@@ -163,7 +149,7 @@ def test_no_value_counts_against_the_mix(encoder: str, agents: int, raised: int,
     with torch.no_grad():
         for p in mixer.parameters():
             p.add_(torch.randn_like(p))
-        obs, values = observation(16, agents), 5 * torch.randn(16, agents)
+        obs, values = observation(SPEC._replace(agents=agents), 16), 5 * torch.randn(16, agents)
         higher = values.clone()
         higher[:, raised % agents] += by
         low, high = mixer(obs, values), mixer(obs, higher)
@@ -174,7 +160,7 @@ def test_no_value_counts_against_the_mix(encoder: str, agents: int, raised: int,
 
 def test_the_flat_mixer_is_the_mix_of_its_own_weights() -> None:
     mixer = ENCODERS["mlp"].mixer(SIZES, 8, 4)
-    obs, values = observation(5), torch.randn(5, 2)
+    obs, values = observation(SPEC, 5), torch.randn(5, 2)
     state = torch.cat((obs.agents, obs.pairs.flatten(2), obs.peers.flatten(2)), -1).flatten(1)
     parts: list[Any] = [mixer.get_submodule(name)(state) for name in ("first", "bias", "second", "value")]
     first, bias, second, value = parts
@@ -184,7 +170,7 @@ def test_the_flat_mixer_is_the_mix_of_its_own_weights() -> None:
 
 def test_the_pairwise_mixer_does_not_mind_the_order_or_the_number_of_agents() -> None:
     mixer = ENCODERS["pairwise"].mixer(SIZES, 8, 4)
-    obs, values, order = observation(6, agents=4, targets=5), torch.randn(6, 4), [2, 0, 3, 1]
+    obs, values, order = observation(SPEC._replace(agents=4, targets=5), 6), torch.randn(6, 4), [2, 0, 3, 1]
     moved = Obs(obs.agents[:, order], obs.pairs[:, order], obs.peers[:, order][:, :, order], obs.first)
     assert torch.allclose(mixer(moved, values[:, order]), mixer(obs, values), atol=1e-5)
     assert not torch.allclose(mixer(obs, values[:, order]), mixer(obs, values), atol=1e-5)
@@ -196,7 +182,7 @@ def test_the_pairwise_mixer_does_not_mind_the_order_or_the_number_of_agents() ->
 @pytest.mark.parametrize("encoder", ENCODERS)
 def test_row_i_of_unshared_networks_comes_from_network_i(encoder: str) -> None:
     nets = team(lambda: ENCODERS[encoder].local(SIZES, 8, 3), 2, share=False)
-    obs = observation(7)
+    obs = observation(SPEC, 7)
     assert isinstance(nets, Unshared)
     out = nets(obs)
     for i, net in enumerate(nets.nets):
@@ -207,7 +193,7 @@ def test_row_i_of_unshared_networks_comes_from_network_i(encoder: str) -> None:
 @pytest.mark.parametrize("encoder", ENCODERS)
 def test_unshared_networks_are_handed_actions_too(encoder: str) -> None:
     nets = team(lambda: ENCODERS[encoder].central(SIZES, 8, 1, own=3, joint=3), 2, share=False)
-    obs, own, joint = observation(7), torch.randn(7, 2, 3), torch.randn(7, 2, 3)
+    obs, own, joint = observation(SPEC, 7), torch.randn(7, 2, 3), torch.randn(7, 2, 3)
     assert isinstance(nets, Unshared)
     each = [net(obs, own=own, joint=joint)[:, i] for i, net in enumerate(nets.nets)]
     assert torch.equal(nets(obs, own=own, joint=joint), torch.stack(each, 1))

@@ -15,6 +15,7 @@ from rhmc.envs import coverage, make_env
 from rhmc.envs.coverage import Config, State
 from rhmc.types import Obs, Step, assigned_reward
 from tests.oracles import coverage as oracle
+from tests.support import seeded
 
 PRESETS = ("flat", "executor", "coordinator")
 WORLDS = 6  # rows in a comparison with the oracle
@@ -22,10 +23,6 @@ WORLDS = 6  # rows in a comparison with the oracle
 quick = settings(deadline=None, max_examples=15)
 seeds = st.integers(0, 2**31)
 presets = st.sampled_from(PRESETS)
-
-
-def generator(seed: int) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
 
 
 def copy_of(rng: torch.Generator) -> torch.Generator:
@@ -127,11 +124,11 @@ def still(*, sensors: list[oracle.Point], headings: list[float], targets: list[o
 @settings(deadline=None, max_examples=5)
 @in_double()
 def test_three_episodes_go_as_in_the_oracle(seed: int, preset: Any) -> None:
-    cfg, rng = Config(preset=preset, agents=3, targets=4), generator(seed)
+    cfg, rng = Config(preset=preset, agents=3, targets=4), seeded(seed)
     state = coverage.initial(cfg, WORLDS, rng)
     worlds = worlds_of(state)
     for _ in range(300):
-        action = torch.randint(3, (WORLDS, 3), generator=generator(seed + 1))
+        action = torch.randint(3, (WORLDS, 3), generator=seeded(seed + 1))
         twin = copy_of(rng)
         state = coverage.transition(cfg, state, action, rng)
         move_worlds(worlds, 0.3, twin)
@@ -146,7 +143,7 @@ def test_three_episodes_go_as_in_the_oracle(seed: int, preset: Any) -> None:
 @in_double()
 def test_slow_targets_move_as_in_the_oracle(seed: int) -> None:
     """At the coordinator's dt of 0.13, where many a target is redrawn for being slow."""
-    rng = generator(seed)
+    rng = seeded(seed)
     state = coverage.initial(Config(preset="coordinator"), WORLDS, rng)
     worlds = worlds_of(state)
     for _ in range(300):
@@ -159,7 +156,7 @@ def test_slow_targets_move_as_in_the_oracle(seed: int) -> None:
 @given(seeds, st.integers(0, 60), presets)
 @quick
 def test_a_move_in_float32_is_right_to_a_centimetre(seed: int, before: int, preset: Any) -> None:
-    cfg, rng = Config(preset=preset), generator(seed)
+    cfg, rng = Config(preset=preset), seeded(seed)
     dt = coverage.PRESETS[cfg.preset].dt
     state = coverage.initial(cfg, WORLDS, rng)
     for _ in range(before):
@@ -175,7 +172,7 @@ def test_rewards_and_sight_are_the_oracles(
     seed: int, n: int, m: int, preset: Any, assigned: bool, penalty: float
 ) -> None:
     n = min(n, m)
-    cfg, rng = Config(preset=preset, agents=n, targets=m, penalty=penalty), generator(seed)
+    cfg, rng = Config(preset=preset, agents=n, targets=m, penalty=penalty), seeded(seed)
     state = double(played(cfg, WORLDS, rng, 3))
     action = torch.randint(3, (WORLDS, n), generator=rng)
     held = torch.rand(WORLDS, n, m, generator=rng) < 0.3 if assigned else torch.ones(WORLDS, n, m, dtype=torch.bool)
@@ -198,7 +195,7 @@ def test_rewards_and_sight_are_the_oracles(
 def test_observations_are_the_oracles(seed: int, n: int, m: int, preset: Any, steps: int, observation: Any) -> None:
     n = min(n, m)
     cfg = Config(preset=preset, agents=n, targets=m, observation=observation)
-    state = played(cfg, WORLDS, generator(seed), steps)
+    state = played(cfg, WORLDS, seeded(seed), steps)
     features = {"paper": oracle.paper_features, "extended": oracle.extended_features}[observation]
     obs = coverage.observe(cfg, double(state))
     assert torch.allclose(obs.pairs.double(), per_pair(worlds_of(state), features), atol=2e-6)
@@ -210,7 +207,7 @@ def test_observations_are_the_oracles(seed: int, n: int, m: int, preset: Any, st
 @given(seeds, st.integers(1, 5), st.integers(0, 12))
 @quick
 def test_options_are_what_turning_step_by_step_would_show(seed: int, n: int, horizon: int) -> None:
-    cfg, rng = Config(agents=n), generator(seed)
+    cfg, rng = Config(agents=n), seeded(seed)
     state = double(played(cfg, WORLDS, rng, 2))
     options = coverage.options(cfg, state, horizon)
     assert options.shape == (WORLDS, n, 2 * horizon + 1, cfg.targets)
@@ -280,7 +277,7 @@ def test_wrapped_angles_are_in_the_half_open_circle(degrees: float) -> None:
 
 def test_actions_turn_five_degrees_left_or_right_and_wrap() -> None:
     state = still(sensors=[(0.0, 0.0)] * 4, headings=[178.0, -178.0, 10.0, 175.0], targets=[(0.0, 0.0)])
-    after = coverage.transition(Config(targets=1), state, torch.tensor([[1, 2, 0, 1]]), generator(0))
+    after = coverage.transition(Config(targets=1), state, torch.tensor([[1, 2, 0, 1]]), seeded(0))
     assert after.heading[0].tolist() == pytest.approx([-177.0, 177.0, 10.0, -180.0])
 
 
@@ -302,7 +299,7 @@ def test_when_a_target_changes_its_mind(change: dict[str, Any], redrawn: bool) -
     state = still(sensors=[(0.0, 0.0)], headings=[0.0], targets=[(0.0, 0.0)])
     fields = {"goal": (500.0, 0.0), "last": (-20.0, 0.0), "before_last": (-40.0, 0.0), "moved": True, "trip": 7.0}
     state = state._replace(**{k: torch.tensor(v).expand(getattr(state, k).shape) for k, v in (fields | change).items()})
-    after = coverage.move_targets(0.3, state, generator(3))
+    after = coverage.move_targets(0.3, state, seeded(3))
     assert (not torch.equal(after.goal, state.goal)) is redrawn
     assert after.trip.item() == (0 if redrawn else state.trip.item() + 1)
     step = torch.linalg.vector_norm(after.targets).item()
@@ -313,7 +310,7 @@ def test_a_target_that_would_leave_decides_again_from_where_it_is() -> None:
     state = still(sensors=[(0.0, 0.0)], headings=[0.0], targets=[(1249.0, 0.0)])
     state = state._replace(goal=torch.tensor([[[1260.0, 0.0]]]), moved=torch.ones(1, 1, dtype=torch.bool))
     state = state._replace(last=state.targets - 20, before_last=state.targets - 40)
-    after = coverage.move_targets(0.3, state, generator(0))
+    after = coverage.move_targets(0.3, state, seeded(0))
     assert after.targets.abs().max() <= 1250
     assert after.goal[0, 0, 0] < 1249
     assert after.trip.item() == 0
@@ -327,7 +324,7 @@ def test_a_target_that_would_leave_decides_again_from_where_it_is() -> None:
 
 @pytest.mark.parametrize("dt", [0.3, 0.13])
 def test_targets_stay_in_the_area_and_keep_moving(dt: float) -> None:
-    rng = generator(1)
+    rng = seeded(1)
     state = coverage.initial(Config(targets=10), 100, rng)
     for _ in range(400):
         state = coverage.move_targets(dt, state, rng)
@@ -340,7 +337,7 @@ def test_targets_stay_in_the_area_and_keep_moving(dt: float) -> None:
 @pytest.mark.parametrize(("dt", "speed"), [(0.3, 73), (0.13, 87)])
 def test_base_speed_of_targets_long_under_way(dt: float, speed: float) -> None:
     """A slow target at the small dt counts as stuck at once, so that slow ones are weeded out."""
-    rng = generator(2)
+    rng = seeded(2)
     state = coverage.initial(Config(targets=10), 200, rng)
     means = []
     for move in range(600):
@@ -356,11 +353,11 @@ def test_the_coordinators_targets_move_eleven_times_in_ten_ticks(
 ) -> None:
     monkeypatch.setattr(coverage, "move_targets", lambda dt, state, rng: state._replace(targets=state.targets + 1))
     cfg = Config(preset=preset)
-    state = coverage.initial(cfg, 2, generator(0))
+    state = coverage.initial(cfg, 2, seeded(0))
     state = state._replace(targets=torch.zeros_like(state.targets), steps=torch.tensor([0, 3]))
     moved = [[0.0, 0.0]]
     for _ in range(20):
-        state = coverage.transition(cfg, state, torch.zeros(2, 4, dtype=torch.int64), generator(0))
+        state = coverage.transition(cfg, state, torch.zeros(2, 4, dtype=torch.int64), seeded(0))
         moved.append(state.targets[:, 0, 0].tolist())
     gains = torch.tensor(moved).diff(dim=0)
     for row, first in ((0, 0), (1, 3)):
@@ -371,7 +368,7 @@ def test_the_coordinators_targets_move_eleven_times_in_ten_ticks(
 @quick
 def test_sensors_start_in_the_first_boxes_one_each(n: int, preset: Any, seed: int) -> None:
     cfg = Config(preset=preset, agents=n, targets=6)
-    state = coverage.initial(cfg, 50, generator(seed))
+    state = coverage.initial(cfg, 50, seeded(seed))
     boxes = torch.tensor(coverage.BOXES[:n])
     x, y = state.sensors.unsqueeze(2).unbind(-1)
     within = (x >= boxes[:, 0]) & (x < boxes[:, 1]) & (y >= boxes[:, 2]) & (y < boxes[:, 3])
@@ -381,7 +378,7 @@ def test_sensors_start_in_the_first_boxes_one_each(n: int, preset: Any, seed: in
 
 
 def test_every_order_of_the_boxes_occurs_alike() -> None:
-    state = coverage.initial(Config(agents=3), 6000, generator(0))
+    state = coverage.initial(Config(agents=3), 6000, seeded(0))
     centres = torch.tensor([(b[0] + b[1], b[2] + b[3]) for b in coverage.BOXES[:3]]) / 2
     order = torch.cdist(state.sensors, centres.float()).argmin(-1)
     _, counts = order.unique(dim=0, return_counts=True)
@@ -391,7 +388,7 @@ def test_every_order_of_the_boxes_occurs_alike() -> None:
 
 @pytest.mark.parametrize(("preset", "half"), [("flat", 800), ("executor", 400), ("coordinator", 1000)])
 def test_targets_and_headings_start_uniform_in_the_presets_square(preset: Any, half: int) -> None:
-    state = coverage.initial(Config(preset=preset), 4000, generator(0))
+    state = coverage.initial(Config(preset=preset), 4000, seeded(0))
     for values, low, high in ((state.targets, -half, half), (state.goal, -1250, 1250), (state.speed, 50, 100)):
         assert low <= values.min() < low + 0.01 * (high - low)
         assert high - 0.02 * (high - low) <= values.max() < high
@@ -411,7 +408,7 @@ def test_targets_and_headings_start_uniform_in_the_presets_square(preset: Any, h
 @pytest.mark.parametrize(("preset", "length"), [("flat", 100), ("executor", 100), ("coordinator", 1000)])
 def test_episodes_have_their_length_and_start_anew(preset: Any, length: int) -> None:
     cfg = Config(preset=preset, agents=1, targets=1)
-    env = make_env(cfg, 2, generator(0))
+    env = make_env(cfg, 2, seeded(0))
     assert env.reset().first.all()
     hold = torch.zeros(2, 1, dtype=torch.int64)
     for t in range(1, 2 * length + 1):
@@ -424,10 +421,10 @@ def test_episodes_have_their_length_and_start_anew(preset: Any, length: int) -> 
 
 def test_a_reset_keeps_the_true_last_observation_and_leaves_other_rows_alone() -> None:
     cfg = Config(observation="extended")
-    env = make_env(cfg, 3, generator(0))
+    env = make_env(cfg, 3, seeded(0))
     env.reset()
     env.state = env.state._replace(steps=torch.tensor([99, 5, 98]))
-    action, before, twin = torch.randint(3, (3, 4), generator=generator(1)), env.state, copy_of(env.rng)
+    action, before, twin = torch.randint(3, (3, 4), generator=seeded(1)), env.state, copy_of(env.rng)
     step = env.step(action, torch.ones(3, 4, 5))
     state = coverage.transition(cfg, before, action, twin)
     expected = coverage.observe(cfg, state)
@@ -445,14 +442,14 @@ def test_a_reset_keeps_the_true_last_observation_and_leaves_other_rows_alone() -
 @pytest.mark.parametrize("preset", PRESETS)
 def test_a_loaded_environment_continues_bit_by_bit(preset: Any) -> None:
     cfg = Config(preset=preset)
-    env = make_env(cfg, 4, generator(0))
+    env = make_env(cfg, 4, seeded(0))
     env.reset()
     env.state = env.state._replace(steps=torch.full((4,), coverage.spec(cfg).episode - 60))
     run(env, 30)
     file = io.BytesIO()
     torch.save(env.state_dict(), file)
     file.seek(0)
-    other = make_env(cfg, 4, generator(99))
+    other = make_env(cfg, 4, seeded(99))
     other.load_state_dict(torch.load(file, weights_only=True))
     for mine, theirs in zip(run(env, 60), run(other, 60), strict=True):  # through a reset
         assert flat(mine) == flat(theirs)
@@ -461,7 +458,7 @@ def test_a_loaded_environment_continues_bit_by_bit(preset: Any) -> None:
 
 def test_a_seed_decides_everything() -> None:
     def trace(seed: int) -> list[Tensor]:
-        env = make_env(Config(), 3, generator(seed))
+        env = make_env(Config(), 3, seeded(seed))
         return [env.reset().pairs, *(s.obs.pairs for s in run(env, 110))]
 
     first = trace(5)

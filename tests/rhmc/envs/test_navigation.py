@@ -17,6 +17,7 @@ from rhmc.envs import make_env, navigation
 from rhmc.envs.base import Env
 from rhmc.types import Obs, assigned_reward
 from tests.oracles import navigation as oracle
+from tests.support import seeded
 
 REWARDS = ("paper", "mpe2", "mpe1")
 ORDERS = ("mpe2", "mpe1")
@@ -29,10 +30,6 @@ starts = st.sampled_from(list(HALF_SIDES))
 seeds = st.integers(0, 2**31)
 counts = st.integers(3, 6)
 quick = settings(deadline=None, max_examples=25)
-
-
-def generator(seed: int) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
 
 
 def uniform(rng: torch.Generator, *shape: int) -> Tensor:
@@ -85,7 +82,7 @@ def assert_near(got: Tensor, want: object, tol: float) -> None:
 @given(seeds, counts, starts, st.sampled_from(ORDERS), st.booleans())
 def test_an_episode_equals_the_oracle(seed: int, n: int, start: Start, order: Any, continuous: bool) -> None:
     cfg = navigation.Config(agents=n, order=order, continuous=continuous)
-    rng, batch = generator(seed), 2
+    rng, batch = seeded(seed), 2
     state = world_state(cfg, batch, rng, start)
     worlds = [scalar_world(state, row) for row in range(batch)]
     for _ in range(25):
@@ -103,7 +100,7 @@ def test_a_step_in_single_precision_is_near_the_oracle(
     seed: int, n: int, start: Start, order: Any, continuous: bool
 ) -> None:
     cfg = navigation.Config(agents=n, order=order, continuous=continuous)
-    rng, batch = generator(seed), 4
+    rng, batch = seeded(seed), 4
     state = world_state(cfg, batch, rng, start)
     action = random_action(cfg, batch, rng)
     got = navigation.transition(cfg, as_float32(state), single(action), rng)
@@ -117,7 +114,7 @@ def test_a_step_in_single_precision_is_near_the_oracle(
 @given(seeds, counts, starts)
 def test_rewards_and_completion_equal_the_oracle(seed: int, n: int, start: Start) -> None:
     cfg = navigation.Config(agents=n)
-    rng, batch = generator(seed), 3
+    rng, batch = seeded(seed), 3
     state = world_state(cfg, batch, rng, start)
     state = state._replace(landmarks=(state.landmarks - state.position).mul(0.2) + state.position)  # some are covered
     worlds = [scalar_world(state, row) for row in range(batch)]
@@ -142,7 +139,7 @@ def test_rewards_and_completion_equal_the_oracle(seed: int, n: int, start: Start
 @given(seeds, counts, starts)
 def test_extended_features_equal_the_oracle(seed: int, n: int, start: Start) -> None:
     cfg = navigation.Config(agents=n, observation="extended")
-    state = world_state(cfg, 1, generator(seed), start)
+    state = world_state(cfg, 1, seeded(seed), start)
     world = scalar_world(state, 0)
     obs = navigation.observe(cfg, state)
     assert_near(obs.pairs[0], [[oracle.extended_pair(world, i, j) for j in range(n)] for i in range(n)], 1e-9)
@@ -153,7 +150,7 @@ def test_extended_features_equal_the_oracle(seed: int, n: int, start: Start) -> 
 
 def test_a_tie_makes_both_agents_the_nearest() -> None:
     cfg = navigation.Config(agents=2, observation="extended")
-    state = navigation.initial(cfg, 1, generator(0))
+    state = navigation.initial(cfg, 1, seeded(0))
     state = state._replace(position=torch.tensor([[[-1.0, 0.0], [1.0, 0.0]]]), landmarks=torch.zeros(1, 2, 2))
     assert navigation.observe(cfg, state).pairs[0, ..., 2:].eq(1).all()  # distance, the other's, nearest
 
@@ -222,7 +219,7 @@ def flat_observation(obs: Obs) -> Tensor:
 @pytest.mark.parametrize("n", [3, 4, 5, 6])
 def test_an_episode_equals_the_published_package(n: int, start: Start, continuous: bool) -> None:
     cfg = navigation.Config(agents=n, reward="mpe2", continuous=continuous)
-    rng = generator(100 * n + continuous)
+    rng = seeded(100 * n + continuous)
     state = world_state(cfg, 1, rng, start)
     published = Published(state, continuous=continuous)
     bumped = 0.0
@@ -251,7 +248,7 @@ def test_an_episode_equals_the_published_package(n: int, start: Start, continuou
 @pytest.mark.parametrize("n", [1, 2, 6])
 def test_sizes_are_as_specified(n: int, continuous: bool, observation: Any) -> None:
     cfg = navigation.Config(agents=n, continuous=continuous, observation=observation)
-    env, batch = make_env(cfg, 7, generator(0)), 7
+    env, batch = make_env(cfg, 7, seeded(0)), 7
     spec = env.spec
     obs = env.reset()
     step = env.step(single(random_action(cfg, batch, env.rng)))
@@ -273,7 +270,7 @@ def test_sizes_are_as_specified(n: int, continuous: bool, observation: Any) -> N
 @pytest.mark.parametrize("episode", [25, 4])
 def test_episodes_have_their_length_and_keep_their_last_observation(episode: int) -> None:
     cfg = navigation.Config(episode=episode)
-    env = make_env(cfg, 6, generator(1))
+    env = make_env(cfg, 6, seeded(1))
     assert env.reset().first.all()
     ages = torch.arange(6) % episode
     env.state = env.state._replace(steps=ages.clone())
@@ -296,7 +293,7 @@ def test_episodes_have_their_length_and_keep_their_last_observation(episode: int
 
 
 def test_starts_fill_the_square_at_rest() -> None:
-    state = navigation.initial(navigation.Config(agents=4), 2000, generator(2))
+    state = navigation.initial(navigation.Config(agents=4), 2000, seeded(2))
     places = torch.cat((state.position, state.landmarks), 1)
     assert places.abs().max() <= 1
     assert places.amax((0, 1)).min() > 0.99
@@ -320,7 +317,7 @@ def same(a: list[Tensor], b: list[Tensor]) -> bool:
 def test_a_seed_decides_everything() -> None:
     runs = []
     for seed in (5, 5, 6):
-        env = make_env(navigation.Config(), 3, generator(seed))
+        env = make_env(navigation.Config(), 3, seeded(seed))
         env.reset()
         runs.append(rollout(env, 30))
     assert same(runs[0], runs[1])
@@ -330,7 +327,7 @@ def test_a_seed_decides_everything() -> None:
 @pytest.mark.parametrize("continuous", [False, True])
 def test_a_checkpoint_continues_bit_for_bit(continuous: bool) -> None:
     cfg = navigation.Config(agents=4, continuous=continuous)
-    env, other = make_env(cfg, 5, generator(7)), make_env(cfg, 5, generator(8))
+    env, other = make_env(cfg, 5, seeded(7)), make_env(cfg, 5, seeded(8))
     env.reset()
     other.reset()
     rollout(env, 12)
@@ -343,21 +340,21 @@ def test_a_checkpoint_continues_bit_for_bit(continuous: bool) -> None:
 
 def test_an_action_is_cut_to_full_force() -> None:
     cfg = navigation.Config(continuous=True)
-    state = navigation.initial(cfg, 2, generator(0))
+    state = navigation.initial(cfg, 2, seeded(0))
     wild = torch.full((2, 3, 2), -7.0)
-    got = navigation.transition(cfg, state, wild, generator(0))
-    assert_near(got.velocity, navigation.transition(cfg, state, wild / 7, generator(0)).velocity, 0)
+    got = navigation.transition(cfg, state, wild, seeded(0))
+    assert_near(got.velocity, navigation.transition(cfg, state, wild / 7, seeded(0)).velocity, 0)
 
 
 def test_agents_on_one_point_and_far_apart_stay_finite() -> None:
     cfg = navigation.Config(agents=4)
     position = torch.tensor([[[0.3, 0.3], [0.3, 0.3], [1e6, 0.0], [0.3, 0.35]]])
-    state = navigation.initial(cfg, 1, generator(0))._replace(position=position)
+    state = navigation.initial(cfg, 1, seeded(0))._replace(position=position)
     force = navigation.contact(position)
     assert_near(force[0, 0], force[0, 1], 1e-4)  # pushed by the fourth alone, not by each other
     assert_near(force.sum(1), [[0, 0]], 1e-4)
     assert_near(force[0, 0], [0, -25], 1e-2)
-    moved = navigation.transition(cfg, state, torch.zeros(1, 4, dtype=torch.int64), generator(0))
+    moved = navigation.transition(cfg, state, torch.zeros(1, 4, dtype=torch.int64), seeded(0))
     assert moved.position.isfinite().all()
     assert moved.velocity.isfinite().all()
 
@@ -366,7 +363,7 @@ def test_agents_on_one_point_and_far_apart_stay_finite() -> None:
 def test_known_levels_are_met(policy: str) -> None:
     """Returns per episode at N = 3 of two policies that need no code, against levels measured elsewhere."""
     cfg = navigation.Config()
-    env = make_env(cfg, 4000, generator(3))
+    env = make_env(cfg, 4000, seeded(3))
     env.reset()
     steps = []
     for _ in range(cfg.episode):
@@ -390,16 +387,16 @@ def test_known_levels_are_met(policy: str) -> None:
 
 def lone_state(seed: int, batch: int, *, speed: float) -> navigation.State:
     """One agent per world in float64, so that nothing bumps into it."""
-    rng = generator(seed)
+    rng = seeded(seed)
     velocity, steps = speed * uniform(rng, batch, 1, 2), torch.zeros(batch, dtype=torch.int64)
     return navigation.State(uniform(rng, batch, 1, 2), velocity, uniform(rng, batch, 1, 2), steps)
 
 
 def travel(cfg: navigation.Config, state: navigation.State, plan: Tensor) -> Tensor:
-    """Whether the lone agents of (B,) worlds cover their landmark after any step of a plan (K, ...): (B,)."""
+    """True if the lone agents of (B,) worlds cover their landmark after any step of a plan (K, ...): (B,)."""
     hit = torch.zeros(len(state.steps), dtype=torch.bool)
     for action in plan:
-        state = navigation.transition(cfg, state, action.expand(len(hit), *action.shape), generator(0))
+        state = navigation.transition(cfg, state, action.expand(len(hit), *action.shape), seeded(0))
         hit |= navigation.outcome(cfg, state, action, None).completed.flatten()
     return hit
 
@@ -425,7 +422,7 @@ def test_wherever_a_plan_leads_is_reachable(
 ) -> None:
     """Also at great speed, where what one step and the next can reach do not overlap."""
     cfg = navigation.Config(agents=1, order=order, continuous=continuous)
-    rng, batch = generator(seed), 200
+    rng, batch = seeded(seed), 200
     start = end = lone_state(seed, batch, speed=speed)
     plan = random_action(cfg, batch, rng)
     for _ in range(horizon):
@@ -441,7 +438,7 @@ def test_wherever_a_plan_leads_is_reachable(
 def test_the_table_is_no_larger_than_what_a_steady_force_reaches(
     seed: int, order: Any, horizon: int, continuous: bool
 ) -> None:
-    """What it says is reachable, some steady force reaches: any in the square, or |x| + |y| <= 1 if discrete."""
+    """States called reachable are reached by a steady force: any in the square, or |x| + |y| <= 1 if discrete."""
     cfg = navigation.Config(agents=1, order=order, continuous=continuous)
     free = cfg.model_copy(update={"continuous": True})
     state = lone_state(seed, 30, speed=2.0)
@@ -454,7 +451,7 @@ def test_the_table_is_no_larger_than_what_a_steady_force_reaches(
         lone = navigation.State(*(part[row].expand(len(forces), *part[row].shape) for part in state))
         near = torch.full((len(forces),), math.inf, dtype=torch.float64)
         for _ in range(horizon):
-            lone = navigation.transition(free, lone, forces.unsqueeze(1), generator(0))
+            lone = navigation.transition(free, lone, forces.unsqueeze(1), seeded(0))
             near = near.minimum((lone.position - lone.landmarks).norm(dim=-1).flatten())
         done[row] = near.min() < 0.1 + 0.05  # the grid of forces is coarse
     assert torch.equal(done, bound)
@@ -464,7 +461,7 @@ def test_the_table_is_no_larger_than_what_a_steady_force_reaches(
 @given(seeds, counts, st.booleans(), st.sampled_from(ORDERS))
 def test_a_longer_horizon_completes_no_less(seed: int, n: int, continuous: bool, order: Any) -> None:
     cfg = navigation.Config(agents=n, continuous=continuous, order=order)
-    state = world_state(cfg, 4, generator(seed), "spread")
+    state = world_state(cfg, 4, seeded(seed), "spread")
     tables = [navigation.options(cfg, state, h) for h in range(8)]
     assert all((a <= b).all() for a, b in itertools.pairwise(tables))
     assert not tables[0][:, :, :-1].any()
@@ -476,7 +473,7 @@ def test_a_longer_horizon_completes_no_less(seed: int, n: int, continuous: bool,
 def test_some_option_contains_whatever_is_completed_after_a_step(seed: int, n: int, start: Start) -> None:
     """With the agents too far apart to bump, the set that an agent covers next fits into one of its options."""
     cfg = navigation.Config(agents=n, order="mpe1")
-    rng = generator(seed)
+    rng = seeded(seed)
     state = world_state(cfg, 8, rng, start)
     lanes = torch.arange(n).view(1, n, 1) * 10.0
     state = state._replace(

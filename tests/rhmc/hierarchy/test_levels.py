@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
-from torch import Generator, Tensor, nn
+from torch import Tensor, nn
 
 from rhmc.algorithms.rhmc import RHMC, Config
 from rhmc.envs import coverage, make_env, navigation
@@ -14,24 +14,17 @@ from rhmc.envs.base import Env
 from rhmc.hierarchy.coordinator import Coordinator, assignment_value, differences
 from rhmc.hierarchy.executor import Executor
 from rhmc.hierarchy.regulation import REGULATORS
-from rhmc.learning.learner import Learner, pack
+from rhmc.learning.learner import Learner
 from rhmc.learning.normalisation import KEPT
 from rhmc.networks.nets import ENCODERS, PairNet, Sizes, append
 from rhmc.types import Batch, Obs, Spec, Transition, assigned_reward
 from tests.blocks import nested
 from tests.oracles import regulation as oracle
+from tests.support import constant, observation, observed, seeded
 
+pytestmark = pytest.mark.usefixtures("short_episodes")
 SPEC = Spec(2, 3, agent_features=1, pair_features=4, peer_features=0, actions=3, continuous=False, episode=9)
 N, M = SPEC.agents, SPEC.targets
-
-
-def seeded(seed: int = 0) -> Generator:
-    return Generator().manual_seed(seed)
-
-
-@pytest.fixture(autouse=True)
-def _seed() -> None:
-    torch.manual_seed(0)
 
 
 def config(**changes: Any) -> Config:
@@ -39,29 +32,15 @@ def config(**changes: Any) -> Config:
     return Config(**nested(few | {"executor.gamma": 0.5, "coordinator.gamma": 0.25} | changes))
 
 
-def observation(batch: int) -> Obs:
-    pairs, agents = torch.randn(batch, N, M, 4), torch.randn(batch, N, 1)
-    return Obs(agents, pairs, torch.zeros(batch, N, N, 0), torch.zeros(batch, dtype=torch.bool))
-
-
 def rows(batch: int = 1, terminated: bool = False, **changes: Tensor) -> Batch:
-    """What both levels may be given; rewards are added by the test."""
+    """The columns that both levels may be given; rewards are added by the test."""
     held = (torch.rand(batch, N, M) < 0.5).float()
-    some = pack(observation(batch)) | pack(observation(batch), "next_")
+    some = observed(SPEC, batch)
     return some | {"assignment": held, "terminated": torch.full((batch,), terminated)} | changes
 
 
-def constant(net: nn.Module, out: list[float]) -> None:
-    """Makes a network return `out`, on its last axis, whatever it sees."""
-    weights = list(net.parameters())
-    with torch.no_grad():
-        for p in weights:
-            p.zero_()
-        weights[-1].copy_(torch.tensor(out).expand_as(weights[-1].view(-1, len(out))).reshape(-1))
-
-
 def outputs(net: nn.Module, call: Any) -> list[Tensor]:
-    """What a network returns during a call."""
+    """The outputs of a network during a call."""
     seen: list[Tensor] = []
     handle = net.register_forward_hook(lambda module, inputs, out: seen.append(out.detach().clone()))
     call()
@@ -112,10 +91,10 @@ def test_executor_goes_up_a_critic_that_prefers_one_action(gradient: str, encode
 def test_executor_explores_by_a_share_of_random_actions() -> None:
     low = Executor(config(executor__epsilon=0.3), SPEC, seeded())
     constant(low.actor.net, [20.0, 0.0, 0.0])
-    drawn = low.act(observation(10_000), torch.zeros(10_000, N, M), seeded(), explore=True)
+    drawn = low.act(observation(SPEC, 10_000), torch.zeros(10_000, N, M), seeded(), explore=True)
     share = drawn.flatten().bincount(minlength=3) / drawn.numel()
     assert share.tolist() == pytest.approx([0.8, 0.1, 0.1], abs=0.02)
-    assert (low.act(observation(9), torch.zeros(9, N, M), seeded(), explore=False) == 0).all()
+    assert (low.act(observation(SPEC, 9), torch.zeros(9, N, M), seeded(), explore=False) == 0).all()
 
 
 def test_executor_rows_hold_the_reward_under_the_assignment() -> None:
@@ -165,7 +144,7 @@ def test_what_an_executor_sees_of_unassigned_targets(encoder: str, mode: str) ->
 
 @pytest.mark.parametrize("mode", ["on", "off"])
 def test_an_executor_knows_which_targets_are_its_own(mode: str) -> None:
-    low, obs = Executor(config(filter=mode, encoder="pairwise"), SPEC, seeded()), observation(3)
+    low, obs = Executor(config(filter=mode, encoder="pairwise"), SPEC, seeded()), observation(SPEC, 3)
     obs = obs._replace(pairs=torch.zeros_like(obs.pairs))
     one, all_ = (torch.zeros(3, N, M), torch.ones(3, N, M))
     (a,), (b,) = (outputs(low.actor.net, lambda g=g: low.act(obs, g, seeded(), explore=False)) for g in (one, all_))
@@ -286,7 +265,7 @@ class Taught(PairNet):
 
 
 def flipped(critic: nn.Module, obs: Obs) -> Tensor:
-    """What a critic says after each pair's last feature in turn is made the other: (B, N, M)."""
+    """The value of a critic after each pair's last feature in turn is made the other: (B, N, M)."""
     out = torch.empty(obs.pairs.shape[:3])
     for i, j in product(range(out.shape[1]), range(out.shape[2])):
         pairs = obs.pairs.clone()
@@ -351,20 +330,20 @@ def test_differences_are_those_of_assigning_and_not_assigning_each_pair(
 @pytest.mark.parametrize("encoder", ["mlp", "pairwise"])
 def test_flips_are_the_critics_values_with_one_pair_changed(encoder: str) -> None:
     critic = ENCODERS[encoder].pairs(Sizes.of(SPEC, pair=1), 16, 1)
-    obs = append(observation(7), pair=(torch.rand(7, N, M, 1) < 0.5).float())
+    obs = append(observation(SPEC, 7), pair=(torch.rand(7, N, M, 1) < 0.5).float())
     with torch.no_grad():
         assert torch.allclose(critic.flips(obs), flipped(critic, obs), atol=1e-5)
 
 
 def test_worth_of_a_known_critic() -> None:
-    obs, held = observation(2), torch.stack((torch.ones(N, M), torch.zeros(N, M)))
+    obs, held = observation(SPEC, 2), torch.stack((torch.ones(N, M), torch.zeros(N, M)))
     value = assignment_value(Taught(WEIGHT.clone(), crowd=2.0), obs, held)
     assert value.tolist() == pytest.approx([WEIGHT.sum().item() - 2 * 25, -2])
 
 
 def test_coordinator_assigns_by_its_logits_and_flips_a_share() -> None:
     high = Coordinator(config(coordinator__assignment_epsilon=0.2), SPEC, seeded())
-    obs = observation(5000)
+    obs = observation(SPEC, 5000)
     for logit, chance in ((30.0, 0.9), (-30.0, 0.1), (0.0, 0.5)):
         constant(high.actor.net, [logit])
         drawn = high.assign(obs, seeded(), explore=True)
@@ -379,11 +358,6 @@ WORLDS: dict[str, Any] = {
     "coverage": coverage.Config(agents=2, targets=3),
     "navigation": navigation.Config(agents=2, episode=7),
 }
-
-
-@pytest.fixture(autouse=True)
-def _short_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(coverage.PRESETS, "flat", coverage.PRESETS["flat"]._replace(episode=7))
 
 
 class Played(NamedTuple):

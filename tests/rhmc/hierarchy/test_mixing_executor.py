@@ -5,28 +5,19 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Generator, Tensor, nn
+from torch import Tensor, nn
 
 from rhmc.algorithms.rhmc import Config
 from rhmc.envs import coverage, make_env
 from rhmc.hierarchy.mixing_executor import QMIXExecutor
-from rhmc.learning.learner import pack
 from rhmc.types import Batch, Obs, Spec, Transition
 from tests.blocks import nested
 from tests.doubles import Known
+from tests.support import observed, seeded
 
 SPEC = Spec(2, 3, agent_features=1, pair_features=4, peer_features=0, actions=3, continuous=False, episode=9)
 N, M = SPEC.agents, SPEC.targets
 NET, SLOW = [[1.0, 5.0, 2.0], [3.0, 0.0, 4.0]], [[10.0, 20.0, 50.0], [7.0, 30.0, 9.0]]
-
-
-def seeded(seed: int = 0) -> Generator:
-    return Generator().manual_seed(seed)
-
-
-@pytest.fixture(autouse=True)
-def _seed() -> None:
-    torch.manual_seed(0)
 
 
 def executor(**changes: Any) -> QMIXExecutor:
@@ -35,8 +26,7 @@ def executor(**changes: Any) -> QMIXExecutor:
 
 
 def rows(batch: int = 1, **changes: Tensor) -> Batch:
-    obs = [Obs(torch.randn(batch, N, 1), torch.randn(batch, N, M, 4), torch.zeros(batch, N, N, 0), None) for _ in "ab"]
-    some = pack(obs[0]) | pack(obs[1], "next_") | {"terminated": torch.zeros(batch, dtype=torch.bool)}
+    some = observed(SPEC, batch) | {"terminated": torch.zeros(batch, dtype=torch.bool)}
     held = (torch.rand(batch, N, M) < 0.5).float()
     return some | {"assignment": held, "action": torch.zeros(batch, N, dtype=torch.int64)} | changes
 

@@ -59,7 +59,7 @@ def every_instance(n: int, d: int, m: int) -> Iterator[tuple[oracle.Options, ora
 
 
 def ones(options: oracle.Options, assignment: oracle.Assignment) -> int:
-    """How many bits of an instance are set."""
+    """The number of bits of an instance that are set."""
     return sum(sum(map(sum, agent)) for agent in options) + sum(map(sum, assignment))
 
 
@@ -246,7 +246,7 @@ def test_the_smallest_counterexample_by_count() -> None:
 
 
 def test_two_agents_reach_the_largest_count() -> None:
-    """Why the counterexample by count needs three agents."""
+    """The reason why the counterexample by count needs three agents."""
     options, assignment = random_instances((300, 2, 4, 5), 0.3, 0.7, torch.Generator().manual_seed(4))
     for o, a in zip(options, assignment, strict=True):
         path = algorithm1_path(o, a, 0.0)

@@ -1,32 +1,19 @@
 """Rows that are kept until they are due: the replay's pace, the rollout's order, values along it."""
 
-import io
-from typing import Any
-
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch import Generator, Tensor
+from torch import Tensor
 
 from rhmc.learning.experience import Experience, Rollout, ends, flat, values
 from rhmc.learning.settings import OffPolicy
 from rhmc.types import Batch, Local, Obs, Transition
 from tests.conformance import assert_same
+from tests.support import seeded, through_a_file
 
 N, M = 2, 3
 CPU = torch.device("cpu")
-
-
-def seeded(seed: int = 0) -> Generator:
-    return Generator().manual_seed(seed)
-
-
-def through_a_file(state: Any) -> Any:
-    file = io.BytesIO()
-    torch.save(state, file)
-    file.seek(0)
-    return torch.load(file, weights_only=True)
 
 
 # The replay
@@ -98,7 +85,7 @@ def test_an_experience_continues_from_a_checkpoint() -> None:
 # The rollout
 
 
-def observation(name: Tensor) -> Obs:
+def named(name: Tensor) -> Obs:
     """An observation that says its name in every number."""
     b = len(name)
     agents, pairs = name.view(b, 1, 1).expand(b, N, 1), name.view(b, 1, 1, 1).expand(b, N, M, 2)
@@ -109,14 +96,14 @@ def step(t: int, batch: int = 4, terminated: Tensor | None = None, truncated: Te
     """Step t: environment b observes 100 t + b, and 100 t + b + 1/2 afterwards."""
     never, name = torch.zeros(batch, dtype=torch.bool), 100.0 * t + torch.arange(batch)
     return Transition(
-        observation(name),
+        named(name),
         (name.long() % 5).unsqueeze(-1).expand(batch, N),
         -name,
         Local(torch.zeros(batch, N, M), torch.zeros(batch, N)),
         torch.zeros(batch, N, M, dtype=torch.bool),
         never if terminated is None else terminated,
         never if truncated is None else truncated,
-        observation(name + 0.5),
+        named(name + 0.5),
         lambda horizon: torch.zeros(0),
         {},
     )

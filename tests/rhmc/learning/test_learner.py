@@ -14,7 +14,7 @@ from rhmc.types import Obs
 from tests.conformance import assert_same
 
 
-def rows(values: list[int]) -> dict[str, Tensor]:
+def labelled(values: list[int]) -> dict[str, Tensor]:
     """Rows that say who they are, in two keys of different shape."""
     x = torch.tensor(values, dtype=torch.float32)
     return {"x": x, "y": torch.stack((x, -x), -1).view(-1, 1, 2)}
@@ -30,7 +30,7 @@ def test_the_ring_holds_the_newest_rows(capacity: int, counts: list[int]) -> Non
     ring, newest, told = replay(capacity), deque[int](maxlen=capacity), 0
     for count in counts:
         values = list(range(told, told + count))
-        ring.add(rows(values))
+        ring.add(labelled(values))
         newest.extend(values)
         told += count
         assert ring.size == len(newest)
@@ -41,15 +41,15 @@ def test_the_ring_holds_the_newest_rows(capacity: int, counts: list[int]) -> Non
 
 def test_a_wrapped_ring_overwrites_its_oldest_rows_in_place() -> None:
     ring = replay(4)
-    ring.add(rows([0, 1, 2]))
-    ring.add(rows([3, 4, 5]))
+    ring.add(labelled([0, 1, 2]))
+    ring.add(labelled([3, 4, 5]))
     assert ring.rows["x"].tolist() == [4, 5, 2, 3]
     assert (ring.next, ring.size) == (2, 4)
 
 
 def test_a_sample_is_uniform_over_the_filled_rows_and_keeps_rows_together() -> None:
     ring = replay(50)
-    ring.add(rows(list(range(20))))
+    ring.add(labelled(list(range(20))))
     drawn = ring.sample(20_000)
     counts = drawn["x"].long().bincount(minlength=50)
     assert counts[20:].sum() == 0
@@ -59,7 +59,7 @@ def test_a_sample_is_uniform_over_the_filled_rows_and_keeps_rows_together() -> N
 
 def test_a_full_ring_is_sampled_to_its_last_row() -> None:
     ring = replay(3)
-    ring.add(rows([0, 1, 2, 3]))
+    ring.add(labelled([0, 1, 2, 3]))
     assert set(ring.sample(200)["x"].tolist()) == {1.0, 2.0, 3.0}
 
 
@@ -67,7 +67,7 @@ def test_samples_are_decided_by_the_generator_given() -> None:
     drawn = []
     for seed in (0, 0, 1):
         ring = replay(30, seed)
-        ring.add(rows(list(range(30))))
+        ring.add(labelled(list(range(30))))
         torch.rand(1)
         drawn.append(ring.sample(50)["x"])
     assert torch.equal(drawn[0], drawn[1])
@@ -76,7 +76,7 @@ def test_samples_are_decided_by_the_generator_given() -> None:
 
 def test_a_row_handed_out_is_not_the_row_kept() -> None:
     ring = replay(3)
-    ring.add(rows([1, 2, 3]))
+    ring.add(labelled([1, 2, 3]))
     ring.sample(10)["x"].zero_()
     assert ring.rows["x"].tolist() == [1, 2, 3]
 
@@ -85,12 +85,12 @@ def test_a_row_handed_out_is_not_the_row_kept() -> None:
 def test_a_ring_continues_from_its_state(added: list[int]) -> None:
     ring, other = replay(6), replay(6)
     for k, count in enumerate(added):
-        ring.add(rows(list(range(10 * k, 10 * k + count))))
-    other.add(rows([99] * 6))  # to be forgotten
+        ring.add(labelled(list(range(10 * k, 10 * k + count))))
+    other.add(labelled([99] * 6))  # to be forgotten
     other.load_state_dict(ring.state_dict())
     assert_same(other.state_dict(), ring.state_dict())
     for each in (ring, other):
-        each.add(rows([70, 71, 72]))
+        each.add(labelled([70, 71, 72]))
     assert_same(other.state_dict(), ring.state_dict())
     assert_same(other.sample(40), ring.sample(40))
 

@@ -30,11 +30,6 @@ TASKS = {  # features: with and without an agent's own and peers
 }
 
 
-@pytest.fixture(autouse=True)
-def _seed() -> None:
-    torch.manual_seed(5)
-
-
 def draw(s: Sizes, batch: int = 2) -> Obs:
     first = torch.zeros(batch, dtype=torch.bool)
     peers = torch.randn(batch, s.agents, s.agents, s.peer)

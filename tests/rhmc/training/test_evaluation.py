@@ -1,4 +1,4 @@
-"""The fixed bank of evaluation episodes."""
+"""The fixed evaluation episodes."""
 
 from typing import Any
 
@@ -66,7 +66,7 @@ class Many(Fixed):
         return torch.full(obs.pairs.shape[:2], self.action), carry, {}
 
 
-def test_a_bank_is_made_of_chunks_that_are_banks() -> None:
+def test_evaluation_episodes_are_made_of_chunks() -> None:
     whole = evaluate(Many(1), SHORT, CHUNK + 1, seed=7)
     first, last = evaluate(Many(1), SHORT, CHUNK, seed=7), evaluate(Many(1), SHORT, 1, seed=7 + CHUNK)
     assert whole.values["return"].shape == (CHUNK + 1,)
@@ -129,8 +129,8 @@ def test_the_assignment_reaches_the_environment() -> None:
 
 
 def test_means_and_the_standard_error() -> None:
-    bank = Episodes({"return": torch.tensor([1.0, 2.0, 6.0]), "coverage": torch.tensor([0.0, 1.0, 0.5])})
-    means = bank.means("eval")
+    episodes = Episodes({"return": torch.tensor([1.0, 2.0, 6.0]), "coverage": torch.tensor([0.0, 1.0, 0.5])})
+    means = episodes.means("eval")
     assert means["eval/return"] == pytest.approx(3)
     assert means["eval/coverage"] == pytest.approx(0.5)
     assert means["eval/return_sem"] == pytest.approx((14 / 2 / 3) ** 0.5)  # squares 4 + 1 + 9, over n - 1, over n
