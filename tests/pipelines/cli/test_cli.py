@@ -124,7 +124,7 @@ def test_the_page_of_the_command_line_names_every_verb() -> None:
     ("line", "offered"),
     [
         ("rhmc st", {"study"}),
-        ("rhmc study ", {"check", "run", "status", "list", "export", "import", "adopt"}),
+        ("rhmc study ", {"check", "run", "status", "list", "export", "import", "adopt", "copy"}),
         ("rhmc study run studies/al", {"studies/alpha.yaml"}),
         ("rhmc study run studies/alpha.yaml --profile q", {"quick"}),
         ("rhmc search run studies/", {"studies/search_rhmc.yaml"}),
