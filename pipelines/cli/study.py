@@ -145,7 +145,7 @@ def export_runs(
         raise InputError(str(error)) from error
     say(f"{out}: {packed.finished} of {packed.planned} runs finished, {packed.begun} under way")
     for line in packed.astray:
-        print(f"left out, for it went astray: {line}", file=sys.stderr)
+        print(f"left out, a value is not finite: {line}", file=sys.stderr)
     say(f"there:  rhmc study import {out.name}")
 
 
