@@ -1,6 +1,7 @@
 """What every method of the table must do, on both encoders and both tasks; and RHMC in its variants."""
 
 import io
+from collections.abc import Iterator
 from functools import cache
 from itertools import product
 from typing import Any, NamedTuple
@@ -671,25 +672,31 @@ LEARNING_OF: dict[str, dict[str, Any]] = {  # what a method needs beside or inst
 STEPS = {"coma": 18_000, "hitmac": 14_000}  # 12 000 else
 
 
-def returns(kind: str, **changes: Any) -> list[float]:
-    """A method's mean return in the tiny task before and after learning."""
+def returns(kind: str, **changes: Any) -> Iterator[float]:
+    """A method's mean return in the tiny task before learning and at each sixth of its steps."""
     config = ALGORITHMS[kind].config
     wanted = LEARNING | LEARNING_OF.get(kind, {})
     known = {k: v for k, v in wanted.items() if k in config.model_fields}
     run = Trainer(
         toy.Config(),  # type: ignore[arg-type]
         config(**known | changes),
-        Config(steps=STEPS.get(kind, 12_000), num_envs=32, evaluations=1, eval_episodes=300, final_episodes=1),
+        Config(steps=STEPS.get(kind, 12_000), num_envs=32, evaluations=6, eval_episodes=300, final_episodes=1),
         seed=0,
     )
-    return [item["eval/return"] for item in run]
+    return (item["eval/return"] for item in run)
 
 
-def assert_learned(found: list[float]) -> None:
-    """To 85 % of what two agents earn that go for a target each; acting at random earns about a third of it."""
-    first, last = found
-    assert first < 0.5 * toy.own_target()
-    assert last > 0.85 * toy.own_target()
+def assert_learned(found: Iterator[float]) -> None:
+    """To 85 % of what two agents earn that go for a target each; acting at random earns about a third of it.
+
+    A run that is clearly above that before its last step need not go on.
+    """
+    best = toy.own_target()
+    assert next(found) < 0.5 * best
+    for last in found:
+        if last > 0.9 * best:
+            break
+    assert last > 0.85 * best
 
 
 @pytest.mark.parametrize("encoder", ["mlp", "pairwise"])
