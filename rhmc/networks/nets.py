@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import elu
 
-from rhmc.networks.linear import Linear
+from rhmc.networks.linear import MLP, Linear, stack
 from rhmc.types import Obs, Spec
 
 EncoderName = Literal["mlp", "pairwise"]
@@ -39,12 +39,12 @@ class Sizes(NamedTuple):
         )
 
 
-def mlp(*sizes: int) -> nn.Sequential:
+def mlp(*sizes: int) -> MLP:
     """Linear layers with ReLU between them; the last one is linear."""
     layers: list[nn.Module] = []
     for i, o in pairwise(sizes):
         layers += [Linear(i, o), nn.ReLU()]
-    return nn.Sequential(*layers[:-1])
+    return MLP(*layers[:-1])
 
 
 def append(obs: Obs, *, agent: Tensor | None = None, pair: Tensor | None = None) -> Obs:
@@ -130,11 +130,10 @@ class _PairBody(nn.Module):
         self.second = Linear(hidden, hidden)
 
     def forward(self, obs: Obs) -> Tensor:
-        rows = obs.pairs.shape[:3]
-        h = self.pair(obs.pairs.flatten(0, 2))  # rows: ReLU in place on a view would copy whole gradients
-        if self.agent is not None:
-            h = (h.unflatten(0, rows) + self.agent(obs.agents).unsqueeze(2)).flatten(0, 2)
-        return self.second(h.relu_()).relu_().unflatten(0, rows)
+        if self.agent is None:
+            return stack(obs.pairs, (self.pair, self.second), last="relu")
+        h = self.pair(obs.pairs) + self.agent(obs.agents).unsqueeze(2)
+        return stack(h.relu_(), (self.second,), last="relu")
 
 
 class _AgentBody(nn.Module):
