@@ -21,7 +21,7 @@ CAPABILITY = "AVX2"  # what torch then says of itself
 X86 = platform.machine().lower() in {"x86_64", "amd64"}
 CPUINFO = Path("/proc/cpuinfo")
 KEPT = 1 << 30  # bytes of freed memory that a process keeps for its next tensors
-ALLOCATOR = {-1: KEPT, -3: KEPT, 1: 0}  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_MXFAST of malloc.h
+ALLOCATOR = {-1: KEPT, -3: KEPT}  # M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of malloc.h
 
 
 def apply() -> None:

@@ -59,7 +59,7 @@ def _stack(x: Tensor, after: list[str], *params: Tensor | None) -> Tensor:
 
 
 def product(a: Tensor, b: Tensor, bias: Tensor | None = None, after: str = "none") -> Tensor:
-    """a b^T + bias: (m, k), (n, k), (n,) -> (m, n), as the sum of the products of `BLOCK` columns each; then `after`."""
+    """a b^T + bias: (m, k), (n, k), (n,) -> (m, n), the sum of the products of `BLOCK` columns each; then `after`."""
     k = a.shape[1]
     if k <= BLOCK:
         return _chain(a, b, bias, after)
@@ -98,7 +98,8 @@ class _Stack(torch.autograd.Function):
         grads: list[Tensor | None] = []  # from the last layer to the first
         for i in reversed(range(len(weights))):
             if ctx.after[i] == "relu":
-                grad = torch.ops.aten.threshold_backward(grad, values[i + 1], 0)
+                into = grad if i + 1 < len(weights) else torch.empty_like(values[i + 1])  # the last one is not ours
+                grad = torch.ops.aten.threshold_backward.grad_input(grad, values[i + 1], 0, grad_input=into)
             by_weight, by_bias = by_params[2 * i : 2 * i + 2]
             grads += [grad.sum(0) if by_bias else None, _outer(grad, values[i]) if by_weight else None]
             if i or by_x:
@@ -130,16 +131,19 @@ def _outer(grad: Tensor, x: Tensor) -> Tensor:
 
 
 def _over_rows(a: Tensor, b: Tensor) -> Tensor:
-    """`product(a.t(), b.t())`: (rows, m), (rows, n) -> (m, n)."""
-    if a.shape[1] < 2 or len(a) < 2:
+    """`product(a.t(), b.t())`, with `a` the narrower: (rows, m), (rows, n) -> (m, n)."""
+    count = len(a) // BLOCK
+    end = count * BLOCK
+    if not count or a.shape[1] < 2:
         return product(a.t(), b.t())
-    whole = len(a) // BLOCK
-    parts = [] if not whole else [*_columns(a[: whole * BLOCK], whole)]
-    parts += [] if len(a) == whole * BLOCK else [*_columns(a[whole * BLOCK :], 1)]
-    total, *rest = (_chain(part, rows.t()) for part, rows in zip(parts, b.split(BLOCK), strict=True))
+    assert _product is not None
+    total, *rest = (
+        _product(columns, rows.t(), None, "none", [], "")
+        for columns, rows in zip(_columns(a[:end], count), b[:end].contiguous().split(BLOCK), strict=True)
+    )
     for part in rest:
         total += part
-    return total
+    return total if end == len(a) else total.add_(_chain(a[end:].t(), b[end:].t()))
 
 
 def _columns(a: Tensor, count: int) -> Tensor:

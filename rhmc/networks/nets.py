@@ -146,10 +146,12 @@ class _AgentBody(nn.Module):
         self.width = 2 * hidden + sizes.agent + (2 * hidden if sizes.peer else 0)
 
     def forward(self, obs: Obs) -> Tensor:
-        parts = [_pool(self.pairs(obs), 2), obs.agents]
+        parts = [_pool(self.pairs(obs), 2)]
+        if obs.agents.shape[-1]:
+            parts.append(obs.agents)
         if self.peers is not None:
             parts.append(_pool(self.peers(obs.peers).relu(), 2))
-        return torch.cat(parts, -1)
+        return torch.cat(parts, -1) if len(parts) > 1 else parts[0]
 
 
 class PairwiseLocal(nn.Module):
@@ -322,8 +324,8 @@ class _MeanMax(torch.autograd.Function):
         by_mean, by_largest = grad.chunk(2, -1)
         is_largest = torch.threshold_(h - largest.unsqueeze(ctx.dim), LEAST, -1.0).add_(1.0)  # 1 or 0
         share = by_largest / is_largest.sum(ctx.dim)  # equals share
-        both = is_largest.mul_(share.unsqueeze(ctx.dim)).add_((by_mean / h.shape[ctx.dim]).unsqueeze(ctx.dim))
-        return both, None
+        mean = by_mean / h.shape[ctx.dim]
+        return torch.addcmul(mean.unsqueeze(ctx.dim), is_largest, share.unsqueeze(ctx.dim), out=is_largest), None
 
 
 def _repool(h: Tensor, new: Tensor, dim: int) -> Tensor:
