@@ -5,13 +5,14 @@ terms are chains of fused multiply-adds, in order, whatever the width of its ins
 processor this is `torch.nn.functional.linear`.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
+from torch.nn.modules import module as modules
 
 from rhmc.portable import X86
 
@@ -30,7 +31,7 @@ class MLP(nn.Sequential):
     """Linear layers with ReLU between them, computed at once: (..., in) -> (..., out)."""
 
     def forward(self, x: Tensor) -> Tensor:
-        return stack(x, [*self][::2], last="none")
+        return super().forward(x) if _watched(self) else stack(x, [*self][::2], last="none")
 
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
@@ -40,8 +41,18 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
 
 def stack(x: Tensor, layers: Sequence[nn.Linear], *, last: str) -> Tensor:
     """Layers with ReLU between them and `last`, "relu" or "none", behind them: (..., in) -> (..., out)."""
+    kinds = ["relu"] * (len(layers) - 1) + [last]
+    if _watched(layers):
+        for layer, kind in zip(layers, kinds, strict=True):
+            x = layer(x).relu() if kind == "relu" else layer(x)
+        return x
     params = [param for layer in layers for param in (layer.weight, layer.bias)]
-    return _stack(x, ["relu"] * (len(layers) - 1) + [last], *params)
+    return _stack(x, kinds, *params)
+
+
+def _watched(layers: Iterable[nn.Module]) -> bool:
+    """Some module has a hook, which sees that one's output: they are computed one by one, to the same bytes."""
+    return bool(modules._global_forward_hooks) or any(layer._forward_hooks for layer in layers)
 
 
 def _stack(x: Tensor, after: list[str], *params: Tensor | None) -> Tensor:

@@ -1,11 +1,14 @@
 """Linear layers against chains of fused multiply-adds, and their derivatives against torch's own."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
+from torch.nn.modules.module import register_module_forward_hook
 
 from rhmc.networks.linear import Linear, _outer, linear, product, stack
 from rhmc.networks.nets import _pool, mlp
@@ -112,6 +115,26 @@ def test_layers_computed_at_once_give_what_one_after_the_other_gives(sizes: tupl
     found, wanted = (torch.autograd.grad(y, given, grad) for y in (together, single))
     assert all(torch.equal(a, b) for a, b in zip(found, wanted, strict=True))
     assert torch.equal(grad, kept)
+
+
+@pytest.mark.parametrize("every", [False, True])
+def test_a_hook_sees_each_layer_and_changes_no_byte(every: bool) -> None:
+    """A hook of one layer, or one of all modules; and where layers stand in no `MLP`."""
+    net, x = mlp(5, 8, 8, 3), torch.randn(7, 5)
+    expected, seen = (net(x), stack(x, [*net][::2], last="relu")), []
+
+    def note(module: nn.Module, inputs: Any, output: Tensor) -> None:
+        if module is net[2]:
+            seen.append(output.detach())
+
+    handle = register_module_forward_hook(note) if every else net[2].register_forward_hook(note)
+    watched = net(x), stack(x, [*net][::2], last="relu")
+    handle.remove()
+    assert all(torch.equal(a, b) for a, b in zip(watched, expected, strict=True))
+    assert len(seen) == 2
+    assert torch.equal(seen[0], seen[1])
+    net(x)
+    assert len(seen) == 2
 
 
 def test_a_rectified_end_leaves_the_gradient_that_comes_in_alone() -> None:
