@@ -79,6 +79,7 @@ WRITERS = tuple(
 )
 # What only these files may import.
 ONLY = {
+    "pydoe": {"pipelines/specs/design.py"},
     "mlflow": {
         "pipelines/tracking/histories.py",
         "pipelines/tracking/mlflow_tracker.py",
@@ -106,7 +107,7 @@ BARRED = {
     "rhmc/hierarchy/filters.py": ("rhmc.networks", "rhmc.learning"),
 }
 # What loading these must not load: help has to answer at once, a check of a study in seconds.
-HEAVY = {"torch", "ray", "mlflow", "numpy", "pandas", "scipy", "matplotlib", "pyarrow", "pydantic"}
+HEAVY = {"pydoe", "torch", "ray", "mlflow", "numpy", "pandas", "scipy", "matplotlib", "pyarrow", "pydantic"}
 LIGHT = {
     "pipelines.cli.main": HEAVY,
     "pipelines.specs.study": HEAVY - {"torch", "numpy", "pydantic"},
@@ -507,6 +508,8 @@ def test_every_study_is_in_the_pipeline(stages: dict) -> None:
     assert [command.split()[-3:] for command in commands] == [["${queue}", "--profile", "${profile}"]] * 2
     assert unmatched("dvc.yaml", {f"studies/{name}.yaml" for name in studies}, queue) == []
     tables = {f"results/${{profile}}/runs/{name}{kind}.parquet" for name in studies for kind in ("", ".runs")}
+    read = {name for name in studies if Study.load(ROOT / "studies" / f"{name}.yaml").readings}
+    tables |= {f"results/${{profile}}/runs/{name}.readings.parquet" for name in read}
     assert unmatched("dvc.yaml", tables, [next(iter(out)) for out in stage["outs"]]) == []
     assert "studies" in stage["deps"]  # the whole folder, and with it what a study includes
 
@@ -540,7 +543,7 @@ def is_search(path: Path) -> bool:
     return path.stem.startswith("search_")
 
 
-NO_PAGE = {"reports/analyses/equivalence.py"}  # what no page is made with
+NO_PAGE = {"reports/analyses/equivalence.py", "reports/analyses/readings.py"}  # what no page is made with
 
 
 def test_the_report_depends_on_all_its_modules(stages: dict) -> None:

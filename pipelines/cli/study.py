@@ -3,7 +3,7 @@
 import shlex
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -27,6 +27,10 @@ from pipelines.cli.common import (
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.files import regular
 
+if TYPE_CHECKING:
+    from pipelines.specs.readings import Plan
+    from pipelines.specs.study import Study
+
 app = typer.Typer(help="Check, run, follow and move studies.", no_args_is_help=True)
 
 
@@ -38,18 +42,55 @@ def check(file: File, profile: Profile = "quick", variant: Variant = None, overr
     from pipelines.workspace.work_folder import Home, work_folder
 
     study = load_study(file, profile, overrides, variant)
-    rows = []
-    for arm, setting in study.arms.items():
-        differs = ", ".join(f"{key}={value}" for key, value in changes(study.base, setting).items()) or "the base"
-        rows.append([arm, differs, str(study.seeds), f"{study.steps:,}", str(setting.trainer.num_envs)])
     say(f"{study.name} ({study.profile}): {study.question}")
     if remark := another(Home(work_folder()), study.name, study.profile, study.file):
         say(remark)
+    shown = [cell.reading for cell in study.cells.values()][:1]  # the arms differ alike in all of them
+    rows = []
+    for arm, setting in study.arms.items():
+        if study.cells and study.cells[arm].reading not in shown:
+            continue
+        differs = ", ".join(f"{key}={value}" for key, value in changes(study.base, setting).items()) or "the base"
+        rows.append([arm, differs, str(study.seeds), f"{study.steps:,}", str(setting.trainer.num_envs)])
     table(["arm", "differs in", "seeds", "steps", "copies"], rows, numbers=("seeds", "steps", "copies"))
-    runs = len(study.arms) * study.seeds
-    say(f"{runs} runs, {runs * study.steps:,} environment steps in all, {study.resources.concurrent} runs at a time")
+    if study.readings:
+        _show_readings(study, study.readings)
+    _show_budget(study)
     for remark in study.remarks:
         say(f"note: {remark}")
+
+
+def _show_readings(study: "Study", plan: "Plan") -> None:
+    """Factors, readings, and effects that cannot be told apart."""
+    readings = {cell.reading: cell.levels for cell in study.cells.values()}
+    say(f"{len(readings)} readings: {plan.kind}; each arm is trained under each")
+    rows = []
+    for factor, levels in plan.factors.items():
+        each = [
+            f"{i} {name} ({sum(one[factor] == name for one in readings.values())})" for i, name in enumerate(levels, 1)
+        ]
+        rows.append([factor, ", ".join(each), plan.generators.get(factor, "")])
+    table(["factor", "levels (readings)", "generator"], rows)
+    say(f"named by the level of {', '.join(plan.factors)}:")
+    say("  " + " ".join(name.partition("=")[2] for name in readings))
+    mains = [effects for effects in plan.confounded if effects[0] in plan.factors]
+    say(f"main effects confounded with interactions of two factors: {len(mains) or 'none'}")
+    if len(plan.confounded) > len(mains):
+        say(f"sets of confounded interactions of two factors: {len(plan.confounded) - len(mains)}")
+    for effects in plan.confounded:
+        say(f"  {' = '.join(effects)}")
+
+
+def _show_budget(study: "Study") -> None:
+    from pipelines.export.pace import estimated
+
+    runs = study.runs()
+    different = len({run.spec.id for run in runs})
+    shared = f", {different} of them different" if different < len(runs) else ""
+    total = f"{different * study.steps:,} environment steps in all"
+    say(f"{len(runs)} runs{shared}, {total}, {study.resources.concurrent} runs at a time")
+    if hours := estimated(study, Path("results") / study.profile / "runs"):
+        say(hours)
 
 
 @app.command("run")

@@ -1,4 +1,4 @@
-"""From the log to three small files per study: all that the reports read.
+"""From the log to three small files per study, four if it has readings: all that the reports read.
 
 The files are canonical: the same log gives the same bytes (sorted rows, no clock, no names that the log made up). Two
 of them are the same bytes wherever results are equal; how and where each run was made has a file of its own.
@@ -11,6 +11,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from pipelines.specs.readings import Plan
 from pipelines.specs.source_file import another
 from pipelines.specs.study import Study
 from pipelines.tracking.plan import Item, items, study_card
@@ -45,11 +46,24 @@ MADE = pa.schema(  # the runs that are there: how and where each was made
         ("adopted", pa.string()),  # from which code, where older code made it
     ]
 )
+READINGS = pa.schema(  # the level of each factor, of every arm of a study with readings
+    [
+        ("study", pa.string()),
+        ("arm", pa.string()),
+        ("contrast", pa.string()),  # the arm as the study's file has it
+        ("reading", pa.string()),
+        ("factor", pa.string()),
+        ("place", pa.int64()),  # of the factor among the factors, from 0
+        ("level", pa.string()),
+        ("number", pa.int64()),  # of the level in its factor, from 0
+    ]
+)
 
 
 def export_study(study: Study, out: Path, home: Path | None = None) -> int:
     """Write `<study>.parquet` (schema `METRICS`), `<study>.runs.parquet` (`RUNS`), `<study>.made.parquet` (`MADE`).
 
+    A study with readings also has `<study>.readings.parquet` (`READINGS`).
     Only runs of the present plan and code are taken; `time/` metrics stay behind, but for the seconds of a run.
 
     Args:
@@ -79,7 +93,7 @@ def export_study(study: Study, out: Path, home: Path | None = None) -> int:
 
 
 def write_tables(study: Study, plan: list[Item], tracker: Tracker | None, out: Path) -> int:
-    """Write the three files and return how many planned runs are not finished."""
+    """Write the files and return how many planned runs are not finished."""
     found = {(run.arm, run.key): run for run in tracker.recorded()} if tracker else {}
     there = [(item, found.get((item.card.arm, item.key))) for item in plan]
     refs = [run.ref for _, run in there if run]
@@ -96,7 +110,20 @@ def write_tables(study: Study, plan: list[Item], tracker: Tracker | None, out: P
     write_parquet(out / f"{study.name}.parquet", METRICS, sorted(values, key=lambda row: row[:6]))
     write_parquet(out / f"{study.name}.runs.parquet", RUNS, sorted(runs, key=lambda row: row[:4]))
     write_parquet(out / f"{study.name}.made.parquet", MADE, sorted(made, key=lambda row: row[:4]))
+    if study.readings:
+        write_parquet(out / f"{study.name}.readings.parquet", READINGS, _levels(study, study.readings))
     return sum(1 for _, run in there if run is None or run.status != "finished")
+
+
+def _levels(study: Study, plan: Plan) -> list[tuple[object, ...]]:
+    """Rows of `READINGS`, by arm and factor."""
+    numbers = {(factor, level): i for factor, levels in plan.factors.items() for i, level in enumerate(levels)}
+    places = {factor: i for i, factor in enumerate(plan.factors)}
+    return sorted(
+        (study.name, arm, cell.arm, cell.reading, factor, places[factor], level, numbers[factor, level])
+        for arm, cell in study.cells.items()
+        for factor, level in cell.levels.items()
+    )
 
 
 def _about(study: Study, item: Item, run: Recorded | None) -> tuple[str, ...]:

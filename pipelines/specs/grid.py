@@ -30,7 +30,7 @@ def points(grid: Node | None, fields: Collection[str], arms: int) -> tuple[list[
     lists = {key: node for key, node in (grid.children if grid else {}).items() if isinstance(node.value, list)}
     if not grid or not lists:
         return [], []
-    faults = [fault for key, node in lists.items() for fault in _faults(key, node, fields)]
+    faults = [fault for key, node in lists.items() for fault in faults_of(key, node, fields)]
     count = prod(len(values(node)) for node in lists.values()) * max(arms, 1)
     if count > MOST:
         faults.append(Fault(grid.key, grid.path, f"{count:,} arms in all; at most {MOST:,}"))
@@ -61,14 +61,15 @@ def replaced(grid: Node | None, by: Node | None) -> tuple[Node | None, list[Faul
     return (merge(grid, instead) if grid else None), faults
 
 
-def _faults(key: str, node: Node, fields: Collection[str]) -> list[Fault]:
+def faults_of(key: str, node: Node, fields: Collection[str]) -> list[Fault]:
+    """What is wrong with a dotted key or its list of values. fields: as in `points`."""
     section, _, field = key.partition(".")
     if not field or section not in {name.partition(".")[0] for name in fields}:
         same = [name for name in fields if name.endswith(f".{key}")]
         near = f"; did you mean '{same[0]}'?" if same else nearest(key, fields)
         text = f"{show(key)} is no key of a run; a dotted name such as algo.alpha{near}"
         return [Fault(node.key, node.path, text)]
-    texts = [_text(value, i) for i, value in enumerate(values(node))]
+    texts = [text_of(value, i) for i, value in enumerate(values(node))]
     faults = []
     for i, value in enumerate(values(node)):
         if texts[i] in texts[:i]:
@@ -78,8 +79,8 @@ def _faults(key: str, node: Node, fields: Collection[str]) -> list[Fault]:
     return faults
 
 
-def _text(value: Node, place: int) -> str:
-    """A value in an arm's name; lists and mappings go by their place among the values, from 1."""
+def text_of(value: Node, place: int) -> str:
+    """A value in a name; lists and mappings go by their place among the values, from 1."""
     if isinstance(value.value, dict | list | Unreadable):
         return f"no. {place + 1}"
     return value.value if isinstance(value.value, str) else show(value.value)
@@ -93,7 +94,7 @@ def _short(keys: Mapping[str, Node]) -> dict[str, str]:
 
 
 def _point(chosen: Sequence[tuple[str, str, Node, int]]) -> Point:
-    name = ", ".join(f"{short}={_text(value, i)}" for short, _, value, i in chosen)
+    name = ", ".join(f"{short}={text_of(value, i)}" for short, _, value, i in chosen)
     return Point(name, reduce(merge, [nested(key.split("."), value) for _, key, value, _ in chosen]))
 
 

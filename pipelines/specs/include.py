@@ -81,6 +81,10 @@ def _layers(root: Node) -> Iterator[tuple[str, ...]]:
     for group in ("profiles", "arms", "variants"):
         if group in root.children:
             yield from ((group, name) for name in root.children[group].children)
+    readings = root.children.get("readings")
+    factors = readings.children.get("factors") if readings else None
+    for name, factor in (factors.children if factors else {}).items():
+        yield from (("readings", "factors", name, level) for level in factor.children)
 
 
 def _at(node: Node, way: Sequence[str]) -> Node | None:

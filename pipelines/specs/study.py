@@ -2,10 +2,11 @@
 
 A file has `question`, `base` (env, algo, trainer), `arms` (each changes the base), `seeds` and `steps` (a number, or
 one for each profile), and may have `grid` (lists of values for dotted keys: every arm, or the base without arms, is
-taken to every combination), `variants` (each changes every arm, whatever its kind), `profiles` (what else a profile
-changes in the base, and in single arms as `changes`; the arms and the values of the grid that it is content with) and
-`resources`. The layers of a run are base, profile, arm, the profile's change of the arm, point of the grid, variant.
-All that is wrong with a file is found before anything starts.
+taken to every combination) or `readings` (every arm is taken to each, see `pipelines.specs.readings`), `variants` (each
+changes every arm, whatever its kind), `profiles` (what else a profile changes in the base, and in single arms as
+`changes`; the arms, the values of the grid and the design of the readings that it is content with) and `resources`. The
+layers of a run are base, profile, reading, arm, the profile's change of the arm, point of the grid, variant. All that
+is wrong with a file is found before anything starts.
 """
 
 import hashlib
@@ -35,6 +36,7 @@ from pipelines.specs.document import (
 )
 from pipelines.specs.grid import MOST, Point, nested, points, replaced
 from pipelines.specs.include import included
+from pipelines.specs.readings import NOTHING, Cell, Plan, ProfileReadings, Reading, Readings, Spelled, spelled
 from pipelines.specs.safe_names import ARM, PROFILES, alike, fault_of_study, simple, study_name, too_long
 from pipelines.workspace.errors import InputError, seen
 from rhmc.algorithms import ALGORITHMS
@@ -147,6 +149,8 @@ class Study(Frozen):
     file: str = ""  # as given, for commands that a person can repeat
     overrides: tuple[str, ...] = ()
     variant: str = ""
+    readings: Plan | None = None
+    cells: dict[str, Cell] = Field(default_factory=dict)  # by arm, where the study has readings
     remarks: tuple[str, ...] = ()  # what is allowed and gives nothing: arms whose budget ends before they learn
 
     @classmethod
@@ -172,9 +176,10 @@ class Study(Frozen):
         if loaded.faults or file is None or wanted.base is None:
             raise StudyError(_no_study(loaded.root) or loaded.faults)
         resolved = {name: getattr(getattr(file, name), profile) for name in COUNTS}
-        fixed = {"question": file.question.strip(), "resources": file.resources, "profile": profile}
+        fixed: dict[str, Any] = {"question": file.question.strip(), "resources": file.resources, "profile": profile}
         fixed |= {"file": str(path), "overrides": tuple(overrides), "variant": variant or ""}
         name = study_name(Path(path), variant or "")
+        fixed |= {"readings": wanted.readings, "cells": wanted.cells}
         fixed["remarks"] = tuple(map(str, dict.fromkeys(wanted.remarks)))
         return cls(name=name, base=wanted.base, arms=wanted.arms, **fixed, **resolved)
 
@@ -241,6 +246,7 @@ class Profile(Layer):
     arms: list[str] | None = Field(None, min_length=1)
     changes: dict[str, Layer] = Field(default_factory=dict)
     grid: Grid = Field(default_factory=dict)
+    readings: ProfileReadings = ProfileReadings()
 
 
 class Profiles(Frozen):
@@ -257,6 +263,7 @@ class File(Frozen):
     base: Base
     arms: dict[str, Layer] = Field(min_length=1)
     grid: Grid = Field(default_factory=dict)
+    readings: Readings | None = None
     variants: dict[str, Layer] = Field(default_factory=dict)
     seeds: SeedCounts
     steps: Counts
@@ -281,6 +288,16 @@ class Resolved(NamedTuple):
     arms: dict[str, Setting]
     faults: list[Fault]
     remarks: Sequence[Fault] = ()
+    readings: Plan | None = None
+    cells: dict[str, Cell] = {}  # noqa: RUF012
+
+
+class Planned(NamedTuple):
+    """An arm at a point of the grid, or under a reading: the arm as written, and all that it states."""
+
+    written: str
+    layer: Node
+    reading: Reading | None = None
 
 
 class Loaded(NamedTuple, Generic[M]):
@@ -390,12 +407,20 @@ def _target(root: Node, key: str) -> list[str]:
         of_profile = i == 2 and parts[0] == "profiles"
         if part == "grid" and (i == 0 or of_profile):  # its keys are dotted themselves
             return [*parts[: i + 1], ".".join(parts[i + 1 :])]
-    start = 1 if parts[0] == "arms" else 3 if parts[0] == "profiles" and parts[2:3] == ["changes"] else 0
-    for name in list(root.children.get("arms", root).children) if start else []:
+    start, names = _named(root, parts)
+    for name in names:
         words = name.split(".")
         if parts[start : start + len(words)] == words:
             return [*parts[:start], name, *parts[start + len(words) :]]
     return parts
+
+
+def _named(root: Node, parts: Sequence[str]) -> tuple[int, list[str]]:
+    """The part of a key that is a person's name, as of an arm, and the names that there are."""
+    if parts[:2] == ["readings", "factors"]:
+        return 2, list(_group(root.children.get("readings", root), "factors"))
+    start = 1 if parts[0] == "arms" else 3 if parts[0] == "profiles" and parts[2:3] == ["changes"] else 0
+    return start, list(_group(root, "arms")) if start else []
 
 
 # Layers to settings
@@ -411,8 +436,20 @@ def _normal(root: Node, counts: Sequence[str]) -> Node:
     for name in ("arms", "profiles", "variants"):
         if name in children and children[name].children:
             filled = {k: v._replace(value={}) if v.value is None else v for k, v in children[name].children.items()}
+            filled = {k: _with_design(v) for k, v in filled.items()} if name == "profiles" else filled
             children[name] = children[name]._replace(value=filled)
-    return root._replace(value=children)
+    return _with_design(root._replace(value=children))
+
+
+def _with_design(node: Node) -> Node:
+    """`design: full` in the readings of a study or a profile written out."""
+    readings = node.children.get("readings")
+    design = readings.children.get("design") if readings else None
+    if readings is None or design is None or not isinstance(design.value, str):
+        return node
+    whole = design._replace(value={"kind": design._replace(path=join(design.path, "kind"))})
+    block = readings._replace(value=readings.children | {"design": whole})
+    return node._replace(value=node.children | {"readings": block})
 
 
 def _settings(root: Node, profile: str, variant: str | None, patches: Sequence[Node]) -> Resolved:
@@ -424,25 +461,28 @@ def _settings(root: Node, profile: str, variant: str | None, patches: Sequence[N
     last = [layer for layer in [_child(_child(root, "variants"), variant or "")] if layer]
     steps = _child(_child(root, "steps"), profile)
     base, faults = _setting([*common, *last] if common else [], steps)
-    planned, found = _planned(root, chosen, patches)
+    planned, plan, found = _planned(root, chosen, patches)
     faults += found + [fault for layer in last for fault in _unstated(common[0] if common else None, layer)]
     arms: dict[str, Setting] = {}
     first: dict[str, str] = {}  # arm by its setting
     owners: dict[Fault, list[str]] = {}
-    for name, (written, arm) in planned.items():
+    for name, (written, arm, reading) in planned.items():
         faults += _unstated(common[0] if common else None, arm)
         setting, found = _setting([*common, arm, *last], steps)
         for fault in set(found) - set(faults):
             owners.setdefault(fault, []).append(written)
         if setting is not None:
             same = first.setdefault(setting.canonical(), name)
-            faults += _twin(same, arm, name, variant) if same != name else []
+            masked = reading and planned[same].written == written  # the arm decides what the readings differ in
+            faults += _twin(same, arm, name, variant) if same != name and not masked else []
             arms[name] = setting
     plain = ("arms.", f"profiles.{profile}.changes.", *(() if _group(root, "arms") else ("grid.",)))
     faults += [f if f.path.startswith(plain) else _owned(f, names) for f, names in owners.items()]
     kept, found = _kept(root, chosen)
-    arms = {name: arm for name, arm in arms.items() if kept is None or planned[name][0] in kept}
-    return Resolved(base, arms, faults + found, _unlearned(arms, steps) if steps else [])
+    arms = {name: arm for name, arm in arms.items() if kept is None or planned[name].written in kept}
+    told = [(name, planned[name].written, planned[name].reading) for name in arms]
+    cells = {name: Cell(arm=arm, reading=r.name, levels=r.levels) for name, arm, r in told if r}
+    return Resolved(base, arms, faults + found, _unlearned(arms, steps) if steps else [], plan, cells)
 
 
 def _unlearned(arms: Mapping[str, Setting], steps: Node) -> list[Fault]:
@@ -457,15 +497,25 @@ def _unlearned(arms: Mapping[str, Setting], steps: Node) -> list[Fault]:
 
 def _planned(
     root: Node, profile: Node | None, patches: Sequence[Node]
-) -> tuple[dict[str, tuple[str, Node]], list[Fault]]:
-    """Every arm of a profile at every point of its grid, by name: the arm as written, and all that it states."""
+) -> tuple[dict[str, Planned], Plan | None, list[Fault]]:
+    """Every arm of a profile at every point of its grid, or under every reading, by name."""
     arms, faults = _changed(_group(root, "arms"), profile, patches)
     grid, found = replaced(_child(root, "grid"), _child(profile, "grid"))
     combined, more = points(grid, FIELDS, len(arms))
-    crossed = _crossed(arms, combined)
-    more += _alike_faults("arm", {name: arm for name, (_, arm) in crossed.items()})
-    more += [_long_name(name, arm) for name, (_, arm) in crossed.items() if len(name) > ARM]
-    return crossed, faults + found + more
+    block = _child(root, "readings")
+    read = _exclusive(block, grid) or spelled(block, _child(profile, "readings"), FIELDS, len(arms))
+    crossed = _under(arms, read.readings) if read.readings else _crossed(arms, combined)
+    more += _alike_faults("arm", {name: arm.layer for name, arm in crossed.items()})
+    more += [_long_name(name, arm.layer) for name, arm in crossed.items() if len(name) > ARM]
+    return crossed, read.plan, faults + found + more + read.faults
+
+
+def _exclusive(readings: Node | None, grid: Node | None) -> Spelled | None:
+    """The fault of a study that has a grid as well as readings."""
+    if readings is None or grid is None:
+        return None
+    text = "not beside a grid; a key of the grid can be a factor"
+    return NOTHING._replace(faults=[Fault(readings.key, readings.path, text)])
 
 
 def _changed(
@@ -482,10 +532,21 @@ def _changed(
     return {name: reduce(merge, changed.get(name, []), arm) for name, arm in arms.items()}, faults
 
 
-def _crossed(arms: Mapping[str, Node], combined: Sequence[Point]) -> dict[str, tuple[str, Node]]:
+def _crossed(arms: Mapping[str, Node], combined: Sequence[Point]) -> dict[str, Planned]:
     if not arms or not combined:
-        return {name: (name, arm) for name, arm in [*arms.items(), *combined]}
-    return {f"{name}, {p.name}": (name, merge(arm, p.layer)) for name, arm in arms.items() for p in combined}
+        return {name: Planned(name, arm) for name, arm in [*arms.items(), *combined]}
+    return {f"{name}, {p.name}": Planned(name, merge(arm, p.layer)) for name, arm in arms.items() for p in combined}
+
+
+def _under(arms: Mapping[str, Node], readings: Sequence[Reading]) -> dict[str, Planned]:
+    """Every arm under every reading; the arm goes before the reading."""
+    pairs = ((name, arm, one) for one in readings for name, arm in arms.items())
+    return {f"{name}, {one.name}": Planned(name, _over(one.layer, arm), one) for name, arm, one in pairs}
+
+
+def _over(layer: Node, arm: Node) -> Node:
+    """An arm over a layer, at the arm's place."""
+    return arm._replace(value=merge(layer, arm).value)
 
 
 def _kept(root: Node, profile: Node | None) -> tuple[set[str] | None, list[Fault]]:

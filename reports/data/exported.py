@@ -26,16 +26,28 @@ MADE = "made"  # `<study>.made.parquet`, which may be missing
 MOVED = "transfer"  # the table of trained policies with other numbers of agents and targets
 PLAYED = ("study", "arm", "seed", "run", "task", "agents", "targets", "trained_agents", "trained_targets", "value")
 ASSIGNED = "assignments"  # `<study>.assignments.parquet`: what the runs of a study assigned while they trained
+READINGS = "readings"  # `<study>.readings.parquet`: the level of each factor, of every arm of a study with readings
+LEVELS = ("study", "arm", "contrast", "reading", "factor", "place", "level", "number")
 FORMS: Mapping[str, tuple[str, ...]] = {
     "points": POINTS,
     "runs": RUNS,
     MADE: (*PLACE, *OWN),
     ASSIGNED: POINTS,
     MOVED: PLAYED,
+    READINGS: LEVELS,
 }
 
 VERSION = (b"rhmc.tables", b"2")  # in the metadata of a table of runs
-WHOLE = ("seed", "step", "agents", "targets", "trained_agents", "trained_targets")  # columns of integers from 0
+WHOLE = (
+    "seed",
+    "step",
+    "agents",
+    "targets",
+    "trained_agents",
+    "trained_targets",
+    "place",
+    "number",
+)  # columns of integers from 0
 NUMBERS = ("value", "seconds")  # columns of numbers; an empty cell is NaN. All others hold words
 UNKNOWN = ("fingerprint", "question", "commit", *TOLD)  # words that may not be known
 STUDY = re.compile(r"[\w-]+(@[\w-]+)?")  # a study's name, and of a variant
@@ -46,7 +58,7 @@ def part(path: Path) -> str:
     if path.name == f"{MOVED}.parquet":
         return MOVED
     second = path.name.removesuffix(".parquet").partition(".")[2]
-    return second if second in ("runs", MADE, ASSIGNED) else "points"
+    return second if second in ("runs", MADE, ASSIGNED, READINGS) else "points"
 
 
 def earlier(path: Path) -> bool:

@@ -1,7 +1,8 @@
 """The exported tables, checked: everything a report shows comes from here.
 
 A folder holds, per study, `<study>.parquet` (one row per run, step and metric), `<study>.runs.parquet` (one row per
-planned run) and, if it came along, `<study>.made.parquet` (how and where runs were made); `sheets` reads them. What is
+planned run) and, if they came along, `<study>.made.parquet` (how and where runs were made) and
+`<study>.readings.parquet` (the levels of each arm's reading); `sheets` reads them. What is
 wrong in them is an error of one line per fault; what is not there yet is listed as missing.
 """
 
@@ -22,12 +23,14 @@ from reports.data.escaping import markdown
 from reports.data.exported import (
     ASSIGNED,
     FORMS,
+    LEVELS,
     MADE,
     MOVED,
     OWN,
     PLACE,
     PLAYED,
     POINTS,
+    READINGS,
     RUNS,
     TOLD,
     config_fault,
@@ -84,6 +87,7 @@ class Results:
         modules: the networks of Figures 1 to 3, one build per encoder.
         scenes: what Figures 4, 5 and 8 show.
         moved: trained policies with other numbers of agents and targets: columns `PLAYED`.
+        levels: columns `LEVELS`: the level of each factor, of every arm of a study with readings.
         notes: what was left out of the tables, in sentences.
         older: studies whose tables an older version exported.
         episodes: an animation of an episode by task, as a GIF.
@@ -96,6 +100,7 @@ class Results:
     modules: Sequence[Build] = ()
     scenes: Scenes | None = None
     moved: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=list(PLAYED)))
+    levels: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=list(LEVELS)))
     notes: tuple[str, ...] = ()
     older: tuple[str, ...] = ()
     episodes: Mapping[str, bytes] = field(default_factory=dict)
@@ -308,11 +313,11 @@ def load(folder: Path, profile: str, only: str | None = None) -> Results:
         gifs = {path.stem.partition("_")[2]: _animation(path) for path in sorted(folder.glob(EPISODES))}
         runs = _with_made(joined["runs"], joined[MADE])
         aside = tuple(path.name.partition(".")[0] for path in files if older(path))
-        results = Results(points, runs, profile, moved=moved, notes=notes, older=aside)
+        results = Results(points, runs, profile, moved=moved, levels=joined[READINGS], notes=notes, older=aside)
         if only is None:
             methods, modules, scenes = drawn
             results = replace(results, methods=methods, modules=modules, scenes=scenes, episodes=gifs)
-        faults = [*_made_faults(joined[MADE]), *_plan_faults(results), *_point_faults(results)]
+        faults = [*_made_faults(joined[MADE]), *_plan_faults(results), *_level_faults(results), *_point_faults(results)]
         if not faults:
             return results
     raise TableError("\n".join(faults))
@@ -403,6 +408,20 @@ def _plan_faults(results: Results) -> Iterator[str]:
         for arm, group in rows.groupby("arm"):
             for seed in sorted(set(seeds) - set(group["seed"])):
                 yield f"{study}, arm {arm!r}, seed {seed}: planned for other arms, and not for this one"
+
+
+def _level_faults(results: Results) -> Iterator[str]:
+    """An arm that is not planned, or has two levels of one factor or none."""
+    levels = results.levels
+    planned = set(zip(results.runs["study"], results.runs["arm"], strict=True))
+    for study, arm in sorted(set(zip(levels["study"], levels["arm"], strict=True)) - planned):
+        yield f"{study}, arm {arm!r}: has a reading, and is not in the plan"
+    for row in levels[levels.duplicated(["study", "arm", "factor"])].itertuples():
+        yield f"{row.study}, arm {row.arm!r}: two levels of factor {row.factor!r}"
+    for name, rows in levels.groupby("study"):
+        counts = rows.groupby("arm")["factor"].nunique()
+        for arm in counts.index[counts < rows["factor"].nunique()]:
+            yield f"{name}, arm {arm!r}: a factor has no level"
 
 
 def _point_faults(results: Results) -> Iterator[str]:

@@ -151,6 +151,25 @@ def test_check_prints_the_plan(rhmc: Rhmc) -> None:
     assert "4 runs, 4,000 environment steps in all" in said.out
 
 
+def test_check_prints_factors_readings_and_what_is_confounded(rhmc: Rhmc) -> None:
+    factors = "{algo.alpha: [0.1, 0.5], algo.lr: [5e-4, 1e-3], algo.horizon: [1, 6], algo.tau: [0.1, 0.2]}"
+    text = STUDY.replace("seeds", f"readings: {{factors: {factors}, design: {{resolution: 4}}}}\nseeds")
+    Path("studies/x.yaml").write_text(text.replace("regulator: none", "regulator: none, horizon: 1"))
+    out = rhmc("study", "check", "studies/x.yaml").out
+    assert "full, reading=1111" in out
+    assert "full, reading=2222" not in out  # each arm stands there once
+    assert "8 readings: a fraction of resolution 4; each arm is trained under each" in out
+    assert "1 0.0005 (4), 2 0.001 (4)" in out
+    assert "  1111 1122 1212 1221 2112 2121 2211 2222" in out
+    assert "main effects confounded with interactions of two factors: none" in out
+    assert "  algo.alpha x algo.lr = algo.horizon x algo.tau" in out
+    assert "32 runs, 32,000 environment steps in all, 2 runs at a time" in out
+    out = rhmc("study", "check", "studies/x.yaml", "--set", "readings.design=full").out
+    assert "16 readings: every combination" in out
+    assert "64 runs, 48 of them different, 48,000 environment steps in all" in out
+    assert "sets of confounded" not in out
+
+
 @pytest.mark.parametrize("verb", [["study", "check"], ["study", "run"], ["study", "status"], ["export"]])
 def test_a_faulty_study_is_refused_by_every_verb(rhmc: Rhmc, tmp_path: Path, verb: list[str]) -> None:
     said = rhmc(*verb, "studies/x.yaml", "--set", "algo.lrr=1", "--set", "seeds=0")

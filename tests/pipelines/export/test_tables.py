@@ -1,5 +1,6 @@
 """From a log to the three files that the reports read."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pandas as pd
@@ -7,13 +8,16 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
-from pipelines.export.tables import MADE, METRICS, RUNS, export_study, write_tables
-from pipelines.specs.study import RunSpec
+from pipelines.export.pace import estimated, paces
+from pipelines.export.tables import MADE, METRICS, READINGS, RUNS, export_study, write_tables
+from pipelines.specs.readings import Cell, Plan
+from pipelines.specs.study import RunSpec, Study
 from pipelines.tracking.plan import Item, items, study_card
 from pipelines.tracking.tracker import MemoryRun, MemoryTracker
 from pipelines.workspace.provenance import Host, host
 from pipelines.workspace.work_folder import StoreError
 from reports.data.exported import FORMS
+from reports.data.frame import TableError, load
 from tests.pipelines.support import CODE, plan, tiny
 
 POINTS = [
@@ -124,8 +128,73 @@ def test_the_same_log_gives_the_same_bytes(shelf: list[MemoryRun], tmp_path: Pat
 
 
 def test_the_reports_read_what_is_exported() -> None:
-    forms = {"points": METRICS, "runs": RUNS, "made": MADE}
+    forms = {"points": METRICS, "runs": RUNS, "made": MADE, "readings": READINGS}
     assert {name: FORMS[name] for name in forms} == {name: tuple(schema.names) for name, schema in forms.items()}
+
+
+def read_study() -> Study:
+    """The tiny study's arms as one arm under two readings."""
+    study = tiny()
+    plan = Plan(factors={"lr": ("low", "high")}, kind="every combination")
+    levels = {"slow": Cell(arm="full", reading="reading=1", levels={"lr": "low"})}
+    levels |= {"fast": Cell(arm="full", reading="reading=2", levels={"lr": "high"})}
+    return study.model_copy(update={"readings": plan, "cells": levels})
+
+
+def test_the_levels_of_readings_go_along(tracker: MemoryTracker, tmp_path: Path) -> None:
+    study = read_study()
+    for item in plan():
+        log(tracker, item, status="interrupted")
+    write_tables(study, plan(study), tracker, tmp_path)
+    assert pd.read_parquet(tmp_path / "tiny.readings.parquet").to_dict("records") == [
+        {"study": "tiny", "arm": arm, "contrast": "full", "reading": reading, "factor": "lr", "place": 0}
+        | {"level": level, "number": number}
+        for arm, reading, level, number in (("fast", "reading=2", "high", 1), ("slow", "reading=1", "low", 0))
+    ]
+    levels = load(tmp_path, "quick").levels
+    assert dict(zip(levels["arm"], levels["level"], strict=True)) == {"fast": "high", "slow": "low"}
+
+
+LEVELS = {
+    "of an arm that is not planned": (
+        lambda t: t.assign(arm=t["arm"].replace("slow", "gone")),
+        ["tiny, arm 'gone': has a reading, and is not in the plan"],
+    ),
+    "twice": (lambda t: pd.concat([t, t[:1]]), ["tiny, arm 'fast': two levels of factor 'lr'"]),
+    "none": (
+        lambda t: pd.concat([t, t[:1].assign(factor="alpha", place=1)]),
+        ["tiny, arm 'slow': a factor has no level"],
+    ),
+}
+
+
+@pytest.mark.parametrize(("change", "said"), LEVELS.values(), ids=LEVELS)
+def test_levels_that_do_not_fit_the_plan_are_refused(
+    tracker: MemoryTracker, tmp_path: Path, change: Callable[[pd.DataFrame], pd.DataFrame], said: list[str]
+) -> None:
+    study = read_study()
+    for item in plan():
+        log(tracker, item, status="interrupted")
+    write_tables(study, plan(study), tracker, tmp_path)
+    file = tmp_path / "tiny.readings.parquet"
+    change(pd.read_parquet(file)).to_parquet(file, index=False)
+    with pytest.raises(TableError) as caught:
+        load(tmp_path, "quick")
+    assert str(caught.value).splitlines() == said
+
+
+def test_the_hours_of_a_study_follow_the_pace_of_finished_runs(tracker: MemoryTracker, tmp_path: Path) -> None:
+    assert estimated(tiny(), tmp_path) == ""
+    log(tracker, plan()[0])
+    log(tracker, plan()[1], status="interrupted")
+    write_tables(tiny(), plan(), tracker, tmp_path)
+    assert paces(tmp_path) == {"iql": 600 / 4}  # of the run that is finished
+    study = tiny(points=9_000)  # two runs of 1.8 M steps
+    assert estimated(study, tmp_path).startswith("about 6.7 hours of one run at a time, 3.3 of 2, at the median pace")
+    once = study.model_copy(update={"arms": {"slow": study.arms["slow"], "same": study.arms["slow"]}})
+    assert estimated(once, tmp_path).startswith("about 3.3 hours of one run at a time")
+    (tmp_path / "tiny.made.parquet").write_bytes(b"PAR1")
+    assert estimated(study, tmp_path) == ""
 
 
 def test_nothing_logged_yet(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -423,9 +423,10 @@ def test_an_unknown_variant() -> None:
 
 # Faulty files. Each: what is written instead of what, and what is said, `...` for a long list in the middle.
 
+EMPTY = "1:1: empty; a study has question, base, arms, grid, readings, variants, seeds, steps, profiles, resources"
 WHOLE = [
-    ("", "1:1: empty; a study has question, base, arms, grid, variants, seeds, steps, profiles, resources"),
-    ("# nothing\n", "1:1: empty; a study has question, base, arms, grid, variants, seeds, steps, profiles, resources"),
+    ("", EMPTY),
+    ("# nothing\n", EMPTY),
     ("- 1\n", "1:1: [1] is not a study; must be a mapping with ... steps, profiles, resources"),
     ("  hello\n", "1:3: 'hello' is not a study; must be a mapping with ... steps, profiles, resources"),
     ("question: [1,\n", "2:1: not YAML: expected the node content, ... (while parsing a flow node)"),
