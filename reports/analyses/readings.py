@@ -1,0 +1,254 @@
+"""Specification curve: what a part contributes under every reading of a study, and which factors decide (Simonsohn,
+Simmons and Nelson 2020, "Specification curve analysis", 10.1038/s41562-020-0912-z).
+
+An effect is the mean final return of the whole method less that of an arm without the part, under one reading: above
+zero where the paper's order holds. Readings count once all planned seeds of both arms are finished. Their intervals
+share one variance, pooled over arms and readings, as two seeds have none of their own. Main effects are those of a
+linear model without interactions. A reading under which an arm learned nothing counts like any other, and is marked.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy.stats import f, permutation_test, t
+
+from reports.data.frame import FINAL, ORDER, Results
+from reports.data.stats import LEVEL, SEED, Interval, holm
+from reports.render.tables import NONE, Table, estimate, number, percent
+
+RESAMPLES = 9_999  # swaps of labels
+NOTHING = "random"  # the yardstick that has learned nothing
+TOLERANCE = 2.0  # points above it that are nothing still
+
+Values = NDArray[np.float64]
+
+
+class Contrast(NamedTuple):
+    """The whole method against an arm without a part, under R readings with S seeds each.
+
+    Attributes:
+        without: the arm as the study's file has it.
+        levels: (R) by reading, a column for each factor, in the study's order.
+        full: (R, S) final returns of the whole method.
+        other: (R, S) of the arm.
+        missing: readings that are not finished.
+    """
+
+    without: str
+    levels: pd.DataFrame
+    full: Values
+    other: Values
+    missing: int
+
+    @property
+    def effects(self) -> Values:
+        """(R,)."""
+        return np.asarray((self.full - self.other).mean(1))
+
+
+class Fit(NamedTuple):
+    """Effects as a sum of one term for each factor, by least squares."""
+
+    levels: pd.DataFrame  # factor, level, readings, and the effect there with its interval
+    factors: pd.DataFrame  # factor, f, p and p corrected for the number of factors
+
+
+def contrasts(results: Results, study: str) -> list[Contrast]:
+    """The first arm of a study with readings against each other one; none without readings."""
+    table = results.levels[results.levels["study"] == study]
+    arms = sorted(set(table["contrast"]), key=lambda arm: (ORDER.index(arm) if arm in ORDER else len(ORDER), arm))
+    return [_contrast(results, table, arms[0], arm) for arm in arms[1:]]
+
+
+def _contrast(results: Results, table: pd.DataFrame, full: str, without: str) -> Contrast:
+    study = str(table["study"].iloc[0])
+    named = table.drop_duplicates("arm").set_index(["contrast", "reading"])["arm"]
+    order = table.sort_values("place")["factor"].unique()
+    own = table[table["contrast"] == full]
+    wide = own.pivot_table(index="reading", columns="factor", values="level", aggfunc="first")[list(order)]
+    pairs = {r: [_whole(results, study, named[arm, r]) for arm in (full, without)] for r in wide.index}
+    done = [r for r, values in pairs.items() if all(len(one) for one in values)]
+    both = np.array([pairs[r] for r in done]).reshape(len(done), 2, -1)
+    return Contrast(without, wide.loc[done], both[:, 0], both[:, 1], len(wide) - len(done))
+
+
+def _whole(results: Results, study: str, arm: str) -> Values:
+    """Final returns of an arm, none as long as a planned seed is not finished."""
+    values = results.finals(study, arm)
+    return values if len(values) == len(results.plan(study, arm)) else values[:0]
+
+
+def intervals(found: Contrast) -> list[Interval]:
+    """The effect under each reading with its interval, from the variance pooled over all readings and both arms."""
+    seeds = found.full.shape[1]
+    if seeds < 2:
+        return [Interval(float(x), np.nan, np.nan, seeds) for x in found.effects]
+    cells = np.concatenate([found.full, found.other])
+    reach = t.ppf((1 + LEVEL) / 2, cells.size - len(cells)) * np.sqrt(cells.var(1, ddof=1).mean() * 2 / seeds)
+    return [Interval(float(x), float(x - reach), float(x + reach), seeds) for x in found.effects]
+
+
+def permuted(found: Contrast) -> float:
+    """Two-sided p of the median effect, if the arms' labels say nothing: swapped within each reading and seed."""
+
+    def median(full: Values, other: Values, axis: int) -> Values:
+        gaps = (full - other).reshape(*full.shape[:-1], *found.full.shape)
+        return np.asarray(np.median(gaps.mean(-1), axis=-1))
+
+    pairs = (found.full.ravel(), found.other.ravel())
+    rng = np.random.default_rng(SEED)
+    test = permutation_test(
+        pairs, median, permutation_type="samples", vectorized=True, n_resamples=RESAMPLES, axis=-1, rng=rng
+    )
+    return float(test.pvalue)
+
+
+def fitted(found: Contrast) -> Fit:
+    """Main effects of the factors on the effect."""
+    blocks = {str(name): _coded(found.levels[name]) for name in found.levels.columns}
+    design = np.column_stack([np.ones(len(found.levels)), *(block.to_numpy() for block in blocks.values())])
+    left = _rss(design, found.effects)
+    free = len(design) - int(np.linalg.matrix_rank(design))
+    inverse = np.linalg.pinv(design)
+    spread = left / free * (inverse @ inverse.T) if free else np.full((design.shape[1],) * 2, np.nan)
+    terms = inverse @ found.effects
+    rows, tests, at = [], [], 1
+    for name, block in blocks.items():
+        columns = np.arange(at, at + block.shape[1])
+        rest = np.delete(design, columns, axis=1)
+        gain = (_rss(rest, found.effects) - left) / len(columns)
+        ratio = gain / (left / free) if free and left > 0 else np.nan
+        tests.append({"factor": name, "f": ratio, "p": float(f.sf(ratio, len(columns), free))})
+        for level, codes in block.drop_duplicates().iterrows():
+            weights = np.zeros(len(terms))
+            weights[0], weights[columns] = 1, codes
+            value, reach = weights @ terms, t.ppf((1 + LEVEL) / 2, free) * np.sqrt(weights @ spread @ weights)
+            count = int((found.levels[name] == level).sum())
+            rows.append({"factor": name, "level": level, "readings": count, "effect": value})
+            rows[-1] |= {"low": value - reach, "high": value + reach}
+        at += len(columns)
+    factors = pd.DataFrame(tests)
+    return Fit(pd.DataFrame(rows), factors.assign(p_corrected=holm(factors["p"].to_numpy(np.float64))))
+
+
+def _coded(levels: pd.Series) -> pd.DataFrame:
+    """Levels as deviations from their mean: a row per reading, named by its level, a column less than levels."""
+    names = sorted(set(levels))
+    codes = np.vstack([np.eye(len(names) - 1), -np.ones(len(names) - 1)])
+    return pd.DataFrame(codes[[names.index(level) for level in levels]], index=list(levels))
+
+
+def _rss(design: Values, values: Values) -> float:
+    return float(((values - design @ (np.linalg.pinv(design) @ values)) ** 2).sum())
+
+
+def unlearned(results: Results, study: str, values: Values) -> NDArray[np.bool_]:
+    """Readings under which an arm learned nothing: its mean is at most `TOLERANCE` above the random policy's. (R,).
+
+    False everywhere without that yardstick.
+    """
+    scores = results.yardsticks_of(study)
+    if FINAL not in scores or NOTHING not in scores.index:
+        return np.zeros(len(values), bool)
+    return np.asarray(values.mean(1) <= scores[FINAL].astype(float).to_dict()[NOTHING] + TOLERANCE)
+
+
+# Tables
+
+
+def curve(results: Results, study: str, found: Contrast) -> Table:
+    """Readings by effect, smallest first, each with the level of every factor."""
+    ranges = intervals(found)
+    arms = {"full": found.full, "without": found.other}
+    idle = {f"{key}_unlearned": unlearned(results, study, values) for key, values in arms.items()}
+    means = {key: values.mean(1) for key, values in arms.items()}
+    columns = {"effect": found.effects, "low": [x.low for x in ranges], "high": [x.high for x in ranges]}
+    order = np.argsort(found.effects, kind="stable")
+    numbers = pd.DataFrame({"reading": found.levels.index} | columns | means | idle)
+    numbers = pd.concat([numbers, found.levels.reset_index(drop=True)], axis=1).iloc[order].reset_index(drop=True)
+    shown = pd.DataFrame(
+        {
+            "Reading": numbers["reading"].str.removeprefix("reading="),
+            "Effect [95 %]": [estimate(ranges[i]) for i in order],
+            "Full": numbers["full"].map(number),
+            "Without": numbers["without"].map(number),
+            "Learned nothing": [_idle(row) for row in numbers[list(idle)].to_numpy(bool)],
+        }
+    )
+    shown = pd.concat([shown, numbers[list(found.levels.columns)]], axis=1)
+    note = (
+        "Effect: mean final return of the whole method less that of the arm; above zero the paper's order holds. All "
+        "intervals have one width, from the variance pooled over readings and arms."
+    )
+    if found.missing:
+        note += f" {found.missing} more readings are not finished."
+    return Table(f"Effect of what '{found.without}' is without, by reading, study {study}", numbers, shown, note)
+
+
+def _idle(row: NDArray[np.bool_]) -> str:
+    return {(True, True): "both", (True, False): "full", (False, True): "without"}.get((row[0], row[1]), NONE)
+
+
+def summary(results: Results, study: str) -> Table:
+    """A row per contrast: in how many readings the paper's order holds, and by how much."""
+    rows = []
+    for found in contrasts(results, study):
+        ranges, effects = intervals(found), found.effects
+        lost = 100 * (found.other.mean(1) / found.full.mean(1) - 1)
+        quarter, median, three = np.quantile(effects, [0.25, 0.5, 0.75])
+        full, other = (unlearned(results, study, x) for x in (found.full, found.other))
+        rows.append(
+            {"without": found.without, "readings": len(effects), "missing": found.missing}
+            | {"holds": (effects > 0).mean(), "clear": np.mean([x.above(0) for x in ranges])}
+            | {"reversed": np.mean([x.below(0) for x in ranges])}
+            | {"median": median, "lower_quartile": quarter, "upper_quartile": three, "p": permuted(found)}
+            | {"median_change": np.median(lost), "full_unlearned": full.sum(), "without_unlearned": other.sum()}
+            | {"both_unlearned": (full & other).sum()}
+        )
+    numbers = pd.DataFrame(rows)
+    shown = pd.DataFrame([_summarised(row) for row in rows])
+    note = (
+        "Holds: the whole method is better. Clear, reversed: the interval of the reading is above, below zero. p: "
+        f"permutation test of the median effect, {RESAMPLES:,} resamples. Learned nothing: at most {TOLERANCE:g} "
+        "points above the random policy; such readings count."
+    )
+    return Table(f"Effects over the readings of study {study}", numbers, shown, note)
+
+
+def _summarised(row: Mapping[str, Any]) -> dict[str, str]:
+    share = {name: f"{100 * row[name]:.0f} %" for name in ("holds", "clear", "reversed")}
+    quartiles = f"[{number(row['lower_quartile'])}, {number(row['upper_quartile'])}]"
+    idle = ", ".join(str(row[f"{name}_unlearned"]) for name in ("full", "without", "both"))
+    return {
+        "Without": row["without"],
+        "Readings": str(row["readings"]),
+        "Order holds": share["holds"],
+        "clear": share["clear"],
+        "reversed": share["reversed"],
+        "Median effect [quartiles]": f"{number(row['median'])} {quartiles}",
+        "p": f"{row['p']:.4f}",
+        "Median change": percent(row["median_change"]),
+        "Learned nothing: full, without, both": idle,
+    }
+
+
+def main_effects(results: Results, study: str) -> Table:
+    """A row per contrast, factor and level: the effect there, averaged over the other factors."""
+    tables, shown = [], []
+    for found in contrasts(results, study):
+        fit = fitted(found)
+        both = fit.levels.merge(fit.factors, on="factor").assign(without=found.without)
+        tables.append(both)
+        for row in both.to_dict("records"):
+            value = Interval(row["effect"], row["low"], row["high"], row["readings"])
+            shown.append(
+                {"Without": found.without, "Factor": row["factor"], "Level": row["level"]}
+                | {"Readings": str(row["readings"]), "Effect [95 %]": estimate(value)}
+                | {"p (Holm)": f"{row['p_corrected']:.4f}"}
+            )
+    note = "A linear model without interactions. p: F test of the factor, corrected for the number of factors."
+    numbers = pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
+    return Table(f"Main effects of the factors of study {study}", numbers, pd.DataFrame(shown), note)

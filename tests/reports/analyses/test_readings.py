@@ -1,0 +1,163 @@
+"""Specification curves against effects that were planted, level by level."""
+
+from collections.abc import Callable
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from reports.analyses import readings
+from reports.data.frame import Results, load
+from tests.reports.factory import study, write, yardsticks
+
+FACTORS = {"alpha": ("0.02", "0.3", "1", "0.1"), "encoder": ("mlp", "pairwise"), "lr": ("0.001", "0.0005")}
+Effect = Callable[[str, str, str], float]
+SEEDS = np.array([-0.5, 0.5])
+
+
+def read(folder: Path, effect: Effect, full: float = 60.0, noise: float = 0.0, drop: str = "") -> Results:
+    """A study whose arm without regulation loses `effect` under each reading.
+
+    Args:
+        noise: deviation of what is added to every run.
+        drop: an arm whose last seed is not there.
+    """
+    rng, arms, rows = np.random.default_rng(0), {}, []
+    for places in product(*(range(len(levels)) for levels in FACTORS.values())):
+        levels = {name: FACTORS[name][place] for name, place in zip(FACTORS, places, strict=True)}
+        code = "reading=" + "".join(str(place + 1) for place in places)
+        for contrast, level in (("full", full), ("no regulation", full - effect(*levels.values()))):
+            arm = f"{contrast}, {code}"
+            arms[arm] = list(level + SEEDS + rng.normal(size=2) * noise)
+            for place, (factor, name) in enumerate(levels.items()):
+                row = {"study": "read", "arm": arm, "contrast": contrast, "reading": code, "factor": factor}
+                rows.append(row | {"place": place, "level": name, "number": places[place]})
+    points, runs = study("read", arms, points=2)
+    if drop:
+        last = (runs["arm"] == drop) & (runs["seed"] == 1)
+        runs.loc[last, "status"] = "partial"
+        points = points[~((points["arm"] == drop) & (points["seed"] == 1) & (points["metric"] == "final/return"))]
+    write(folder, (points, runs), yardsticks())
+    pd.DataFrame(rows).to_parquet(folder / "read.readings.parquet")
+    return load(folder, "quick")
+
+
+def one(results: Results) -> readings.Contrast:
+    (found,) = readings.contrasts(results, "read")
+    return found
+
+
+def by_alpha(alpha: str, encoder: str, lr: str) -> float:
+    return {"0.02": -1.0, "0.1": 2.0, "0.3": 5.0, "1": 30.0}[alpha] + {"mlp": 0.0, "pairwise": 1.0}[encoder]
+
+
+def test_effects_are_the_whole_method_less_the_arm_by_reading(tmp_path: Path) -> None:
+    found = one(read(tmp_path, by_alpha))
+    assert found.without == "no regulation"
+    assert (len(found.effects), found.full.shape, found.missing) == (16, (16, 2), 0)
+    assert list(found.levels.columns) == list(FACTORS)
+    planted = [by_alpha(*row) for row in found.levels.to_numpy(str)]
+    assert found.effects == pytest.approx(planted)
+
+
+def test_intervals_share_the_pooled_variance(tmp_path: Path) -> None:
+    found = one(read(tmp_path, by_alpha))
+    reach = 2.0369 * np.sqrt(0.5 * 2 / 2)  # t with 32 degrees; each pair of seeds has variance 0.5
+    for value, effect in zip(readings.intervals(found), found.effects, strict=True):
+        assert (value.value, value.low, value.high) == pytest.approx((effect, effect - reach, effect + reach), abs=1e-4)
+    single = found._replace(full=found.full[:, :1], other=found.other[:, :1])
+    assert all(np.isnan(value.low) for value in readings.intervals(single))
+
+
+def test_main_effects_are_those_that_were_planted(tmp_path: Path) -> None:
+    fit = readings.fitted(one(read(tmp_path, by_alpha)))
+    effects = fit.levels.set_index(["factor", "level"])["effect"]
+    assert effects["alpha"].to_dict() == pytest.approx({"0.02": -0.5, "0.1": 2.5, "0.3": 5.5, "1": 30.5})
+    assert effects["encoder"].to_dict() == pytest.approx({"mlp": 9.0, "pairwise": 10.0})
+    assert effects["lr"].to_dict() == pytest.approx({"0.001": 9.5, "0.0005": 9.5})
+    assert fit.levels.set_index(["factor", "level"])["readings"]["alpha"].to_dict() == dict.fromkeys(
+        FACTORS["alpha"], 4
+    )
+
+
+def test_the_model_agrees_with_the_means_of_a_balanced_design_and_its_analysis_of_variance(tmp_path: Path) -> None:
+    found = one(read(tmp_path, by_alpha, noise=3.0))
+    fit = readings.fitted(found)
+    between, left = {}, ((found.effects - found.effects.mean()) ** 2).sum()
+    for name in FACTORS:
+        groups = pd.Series(found.effects).groupby(found.levels[name].to_numpy())
+        means = groups.mean()
+        rows = fit.levels[fit.levels["factor"] == name].set_index("level")
+        assert rows["effect"].to_dict() == pytest.approx(means.to_dict())
+        between[name] = (groups.size() * (means - found.effects.mean()) ** 2).sum()
+        left -= between[name]
+    free = 16 - 1 - 3 - 1 - 1
+    ratios = {name: between[name] / (len(FACTORS[name]) - 1) / (left / free) for name in FACTORS}
+    assert fit.factors.set_index("factor")["f"].to_dict() == pytest.approx(ratios)
+    reach = 2.2281 * np.sqrt(left / free / 8)  # t with 10 degrees; a level of two has 8 readings
+    row = fit.levels.set_index(["factor", "level"]).loc[("encoder", "mlp")]
+    assert (row["high"] - row["effect"], row["effect"] - row["low"]) == pytest.approx((reach, reach), rel=1e-4)
+
+
+def test_the_deciding_factor_is_found_and_the_others_are_not(tmp_path: Path) -> None:
+    p = readings.fitted(one(read(tmp_path, by_alpha, noise=1.0))).factors.set_index("factor")["p_corrected"]
+    assert p["alpha"] < 1e-6
+    assert p["lr"] > 0.05
+
+
+def test_the_permutation_test_finds_a_median_and_not_a_few_large_effects(tmp_path: Path) -> None:
+    assert readings.permuted(one(read(tmp_path / "a", by_alpha))) < 0.001
+    few: Effect = lambda alpha, encoder, lr: 30.0 if (alpha, encoder, lr) == ("1", "mlp", "0.001") else 0.0  # noqa: E731
+    assert readings.permuted(one(read(tmp_path / "b", few, noise=1.0))) > 0.05
+
+
+def test_readings_that_learned_nothing_are_counted(tmp_path: Path) -> None:
+    lost: Effect = lambda alpha, encoder, lr: 29.0 if alpha == "1" else 0.0  # noqa: E731
+    results = read(tmp_path / "a", lost)
+    (row,) = readings.summary(results, "read").numbers.to_dict("records")
+    assert (row["full_unlearned"], row["without_unlearned"], row["both_unlearned"]) == (0, 4, 0)
+    assert row["readings"] == 16
+    table = readings.curve(results, "read", one(results)).shown
+    assert table["Learned nothing"].tolist() == ["–"] * 12 + ["without"] * 4
+    idle = read(tmp_path / "b", lambda *_: 0.0, full=31.0)
+    (row,) = readings.summary(idle, "read").numbers.to_dict("records")
+    assert (row["full_unlearned"], row["both_unlearned"]) == (16, 16)
+
+
+def test_the_summary_counts_the_readings_in_which_the_order_holds(tmp_path: Path) -> None:
+    (row,) = readings.summary(read(tmp_path, by_alpha), "read").numbers.to_dict("records")
+    # -1 and 0 with alpha 0.02, 2 and 3 with 0.1, 5 and 6 with 0.3, 30 and 31 with 1; intervals reach 1.44 to each side
+    assert (row["holds"], row["clear"], row["reversed"]) == (0.75, 0.75, 0.0)
+    assert (row["median"], row["lower_quartile"], row["upper_quartile"]) == pytest.approx((4.0, 1.5, 12.0))
+    assert row["median_change"] == pytest.approx(-100 * 4 / 60)
+    (row,) = readings.summary(read(tmp_path / "b", lambda *_: -2.0), "read").numbers.to_dict("records")
+    assert (row["holds"], row["clear"], row["reversed"]) == (0.0, 0.0, 1.0)
+
+
+def test_the_curve_is_sorted_and_has_the_level_of_each_factor(tmp_path: Path) -> None:
+    results = read(tmp_path, by_alpha)
+    table = readings.curve(results, "read", one(results))
+    assert table.numbers["effect"].is_monotonic_increasing
+    assert [by_alpha(*row) for row in table.numbers[list(FACTORS)].to_numpy(str)] == pytest.approx(
+        table.numbers["effect"].tolist()
+    )
+    assert table.shown["Effect [95 %]"].iloc[0] == "−1.0 [−2.4, 0.4]"
+    first = table.numbers.iloc[0]
+    assert (first["full"], first["without"]) == pytest.approx((60.0, 61.0))
+
+
+def test_a_reading_that_is_not_finished_is_left_out_and_said(tmp_path: Path) -> None:
+    results = read(tmp_path, by_alpha, drop="no regulation, reading=111")
+    found = one(results)
+    assert (len(found.effects), found.missing) == (15, 1)
+    assert "reading=111" not in found.levels.index
+    assert readings.curve(results, "read", found).note.endswith("1 more readings are not finished.")
+
+
+def test_main_effects_as_a_table(tmp_path: Path) -> None:
+    table = readings.main_effects(read(tmp_path, by_alpha, noise=1.0), "read")
+    assert len(table.shown) == 8
+    assert set(table.shown["Without"]) == {"no regulation"}
+    assert list(table.shown["Factor"].unique()) == list(FACTORS)
