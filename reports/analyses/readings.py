@@ -119,7 +119,7 @@ def fitted(found: Contrast) -> Fit:
     for name, block in blocks.items():
         columns = np.arange(at, at + block.shape[1])
         rest = np.delete(design, columns, axis=1)
-        gain = (_rss(rest, found.effects) - left) / 1
+        gain = (_rss(rest, found.effects) - left) / len(columns)
         ratio = gain / (left / free) if free and left > 0 else np.nan
         tests.append({"factor": name, "f": ratio, "p": float(f.sf(ratio, len(columns), free))})
         for level, codes in block.drop_duplicates().iterrows():

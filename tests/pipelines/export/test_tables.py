@@ -186,7 +186,7 @@ def test_levels_that_do_not_fit_the_plan_are_refused(
 def test_the_hours_of_a_study_follow_the_pace_of_finished_runs(tracker: MemoryTracker, tmp_path: Path) -> None:
     assert estimated(tiny(), tmp_path) == ""
     log(tracker, plan()[0])
-    log(tracker, plan()[1], status="interrupted")
+    log(tracker, plan()[1], points=2, status="interrupted")
     write_tables(tiny(), plan(), tracker, tmp_path)
     assert paces(tmp_path) == {"iql": 600 / 4}  # of the run that is finished
     study = tiny(points=9_000)  # two runs of 1.8 M steps

@@ -111,6 +111,8 @@ def test_the_permutation_test_finds_a_median_and_not_a_few_large_effects(tmp_pat
     assert readings.permuted(one(read(tmp_path / "a", by_alpha))) < 0.001
     few: Effect = lambda alpha, encoder, lr: 30.0 if (alpha, encoder, lr) == ("1", "mlp", "0.001") else 0.0  # noqa: E731
     assert readings.permuted(one(read(tmp_path / "b", few, noise=1.0))) > 0.05
+    most: Effect = lambda alpha, encoder, lr: -200.0 if (alpha, encoder, lr) == ("1", "mlp", "0.001") else 2.0  # noqa: E731
+    assert readings.permuted(one(read(tmp_path / "c", most, noise=0.2))) < 0.001
 
 
 def test_readings_that_learned_nothing_are_counted(tmp_path: Path) -> None:
