@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from scipy.stats import t
 
-from reports.analyses.equivalence import compare, differing, finals, read, summary, table
+from reports.analyses.equivalence import compare, compare_runs, differing, finals, read, summary, table
 from reports.data.frame import TableError
 from reports.data.stats import equivalence, equivalence_of_pairs
 from tests.reports import factory
@@ -144,3 +144,39 @@ def test_folders_are_read_whole_or_not_at_all(tmp_path: Path) -> None:
     (tmp_path / "main.parquet").write_bytes(b"no table")
     with pytest.raises(TableError, match="not exported tables"):
         read(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("shift", "spread", "expected"),
+    [
+        (0.5, 0.115, "equivalent"),  # p = 0.05 at 0.5 / (sqrt 2 spread) = 2.92, that is, 0.121
+        (0.5, 0.127, UNSHOWN),
+        (0.98, 0.001, "equivalent"),
+        (1.02, 0.001, UNSHOWN),
+        (-1.02, 0.001, UNSHOWN),
+    ],
+)
+def test_arms_are_equivalent_within_one_point_at_five_percent(shift: float, spread: float, expected: str) -> None:
+    published = tables(a=[60 - spread, 60 + spread])
+    here = tables(a=[60 + shift - spread, 60 + shift + spread])
+    (one,) = compare(here, published)
+    assert one.outcome == expected
+    (same,) = compare(here, published, margin=5.0)
+    assert same.outcome == "equivalent"
+
+
+@pytest.mark.parametrize(
+    ("shift", "spread", "expected"),
+    [
+        (0.5, 0.075, "equivalent"),  # p = 0.05 at 0.5 / spread = 6.31, that is, 0.0792
+        (0.5, 0.083, UNSHOWN),
+        (0.98, 0.001, "equivalent"),
+        (1.02, 0.001, UNSHOWN),
+        (-1.02, 0.001, UNSHOWN),
+    ],
+)
+def test_runs_are_equivalent_within_one_point_at_five_percent(shift: float, spread: float, expected: str) -> None:
+    published = tables(a=[60.0, 61.0, 59.0])
+    here = tables(a=[60 + shift - spread, 61 + shift + spread, 59.0])
+    assert [one.outcome for one in compare_runs(here, published)] == [expected, expected, "byte-equal"]
+    assert compare_runs(here, published, margin=5.0)[0].outcome == "equivalent"
