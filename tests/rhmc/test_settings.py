@@ -1,11 +1,16 @@
 """Settings: the defaults on which results depend, and the bounds of numbers, in one table."""
 
+import ast
+import importlib
+import inspect
+import pkgutil
 from collections.abc import Iterator
 from typing import Any
 
 from annotated_types import Ge, Gt, Le
 from pydantic import BaseModel
 
+import rhmc
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import ENVS
 from rhmc.training import trainer
@@ -136,3 +141,91 @@ def test_defaults_and_bounds_are_those_of_the_published_results() -> None:
             owners.setdefault(setting, []).append(owner)
     rows = [f"{name} {bounds}: {default} ({', '.join(of)})" for (name, bounds, default), of in owners.items()]
     assert sorted(row.replace(" :", ":") for row in rows) == TABLE.splitlines()
+
+
+CONSTANTS = """\
+algorithms.hitmac.PRACTISED = 10
+algorithms.ppo.POLICY_GAIN = 0.01
+envs.coverage.BOXES[0] = (250, 750, 250, 750)
+envs.coverage.BOXES[1] = (250, 750, -750, -250)
+envs.coverage.BOXES[2] = (-1250, -750, -250, 250)
+envs.coverage.BOXES[3] = (-750, -250, 250, 750)
+envs.coverage.BOXES[4] = (750, 1250, -250, 250)
+envs.coverage.BOXES[5] = (-750, -250, -750, -250)
+envs.coverage.FIRST_MOVE = 30.0
+envs.coverage.GOAL_RADIUS = 5.0
+envs.coverage.HALF_AREA = 1250.0
+envs.coverage.HALF_VIEW = 45.0
+envs.coverage.PATIENCE = 100
+envs.coverage.RANGE = 800.0
+envs.coverage.REDRAWS = 50
+envs.coverage.STUCK = 10.0
+envs.coverage.TURN = 5.0
+envs.coverage.TURNS = (0.0, 5.0, -5.0)
+envs.navigation.CONTACT = 0.3
+envs.navigation.DIRECTIONS[0] = (0.0, 0.0)
+envs.navigation.DIRECTIONS[1] = (-1.0, 0.0)
+envs.navigation.DIRECTIONS[2] = (1.0, 0.0)
+envs.navigation.DIRECTIONS[3] = (0.0, -1.0)
+envs.navigation.DIRECTIONS[4] = (0.0, 1.0)
+envs.navigation.DT = 0.1
+envs.navigation.FAR = 2.8284271247461903
+envs.navigation.FORCE = 5.0
+envs.navigation.KEPT = 0.75
+envs.navigation.NEAR = 0.1
+envs.navigation.SOFTNESS = 0.001
+envs.navigation.STIFFNESS = 100.0
+hierarchy.mixing_executor.MIXING_EMBED_DIM = 32
+hierarchy.regulation.MOST_TARGETS = 12
+hierarchy.theorem.CHUNK = 5000
+hierarchy.theorem.COUNTING = 100.0
+hierarchy.theorem.CROWDED = (4, 5, 8)
+hierarchy.theorem.DENSITIES[0] = (0.3, 0.5)
+hierarchy.theorem.DENSITIES[1] = (0.3, 1.0)
+hierarchy.theorem.DENSITIES[2] = (0.5, 0.5)
+hierarchy.theorem.DENSITIES[3] = (0.5, 1.0)
+hierarchy.theorem.SIZES[0] = (2, 2, 3)
+hierarchy.theorem.SIZES[1] = (4, 3, 5)
+hierarchy.theorem.SIZES[2] = (4, 5, 8)
+hierarchy.theorem.SIZES[3] = (4, 13, 5)
+hierarchy.theorem.TOLERANCE = 1e-05
+learning.normalisation.KEPT = 0.999
+learning.normalisation.LEAST = 0.01
+networks.linear.BLOCK = 512
+networks.nets.LEAST = -1e-45
+training.evaluation.CHUNK = 500
+yardsticks.coverage.CENTRE = 0.001
+yardsticks.coverage.HORIZON = 30
+yardsticks.coverage.IDLE = 0.01
+yardsticks.coverage.PASSES = 2
+yardsticks.joint.MOST_ITEMS = 16
+yardsticks.scores.CHUNK = 200
+"""
+
+
+def constants() -> Iterator[str]:
+    """Numbers that modules of the science name, and groups of them."""
+    for found in pkgutil.walk_packages(rhmc.__path__, "rhmc."):
+        module = importlib.import_module(found.name)
+        for name in assigned(inspect.getsource(module)):
+            for part, value in parts(name, getattr(module, name)):
+                yield f"{found.name.removeprefix('rhmc.')}.{part} = {value}"
+
+
+def assigned(source: str) -> Iterator[str]:
+    """Names of constants that a module gives a value to."""
+    for statement in ast.parse(source).body:
+        if isinstance(statement, ast.Assign | ast.AnnAssign):
+            yield from (node.id for node in ast.walk(statement) if isinstance(node, ast.Name) and node.id.isupper())
+
+
+def parts(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """A number or a group of numbers; of a group of groups each."""
+    if isinstance(value, tuple) and all(isinstance(one, tuple) for one in value):
+        yield from ((f"{name}[{i}]", one) for i, one in enumerate(value))
+    elif all(type(one) in (int, float) for one in (value if isinstance(value, tuple) else (value,))):
+        yield name, value
+
+
+def test_numbers_of_the_science_are_those_of_the_published_results() -> None:
+    assert sorted(set(constants())) == CONSTANTS.splitlines()

@@ -38,7 +38,7 @@ from pipelines.tuning.best_params import file_name, winner_yaml
 from pipelines.tuning.ray_workers import Failed
 from pipelines.tuning.search_plots import plots
 from pipelines.tuning.search_run import Drive, TrialLog, results, run_search, search_card, show_search
-from pipelines.tuning.trials import ATTEMPTS, ArmStudy, look, open_storage
+from pipelines.tuning.trials import ArmStudy, look, open_storage
 from pipelines.workspace.work_folder import Home, StoreError
 from rhmc.training.trainer import Trainer
 from tests.pipelines.execution.test_trainable import same
@@ -101,7 +101,8 @@ def test_every_arm_has_the_same_budget_task_and_evaluation() -> None:
 
 def test_a_search_trains_and_evaluates_on_what_no_study_meets() -> None:
     search = load()
-    assert search.seed_list() == [FIRST_SEED, FIRST_SEED + 1]
+    assert search.seed_list() == [500_000, 500_001] == [FIRST_SEED, FIRST_SEED + 1]
+    assert EVAL_SEED == 20_000_000, "a search that goes on has met these episodes"
     assert {arm.setting.trainer.eval_seed for arm in search.arms.values()} == {EVAL_SEED}
     assert setting().trainer.eval_seed != EVAL_SEED
     told = load(changed("num_envs: 8", "num_envs: 8, eval_seed: 7"))
@@ -477,6 +478,45 @@ def test_trials_that_fall_behind_are_given_up(tmp_path: Path, pruner: str) -> No
     assert set(states) == {("complete", "finished", True), ("pruned", "finished", False)}
 
 
+def test_a_pruned_trial_never_wins_and_of_equals_the_earliest_does(tmp_path: Path) -> None:
+    (iql, _) = World(load(), tmp_path).arm_studies()
+    first, second, third, fourth = (iql.ask() for _ in range(4))
+    assert first is not None
+    assert second is not None
+    assert third is not None
+    assert fourth is not None
+    iql.report(third, {"step": 200.0, "eval/return": 99.0}, 1)
+    iql.prune(third, "behind the others")
+    assert iql.best() is None
+    iql.complete(fourth, [3.0, 4.0])
+    iql.complete(second, [3.0, 5.0])
+    iql.complete(first, [4.0, 4.0])
+    best = iql.best()
+    assert best is not None
+    assert (best.trial_index, best.value, best.returns) == (0, 4.0, [4.0, 4.0])
+    assert (iql.closed, iql.left) == (4, 1)
+
+
+@pytest.mark.parametrize(("warmup", "given_up_at"), [(1, 1), (2, 2), (3, 3)])
+def test_the_pruner_waits_for_its_points_and_trials(tmp_path: Path, warmup: int, given_up_at: int) -> None:
+    """Two good trials, of which the median is made, then one that is bad from the start."""
+    (iql, _) = World(load(GOOD + f"pruner: {{kind: median, startup: 2, warmup: {warmup}}}\n"), tmp_path).arm_studies()
+
+    def points(trial: Any, height: float) -> list[int]:
+        curve = [{"step": 200.0 * k, "eval/return": height} for k in range(1, 5)]
+        return [k for k, one in enumerate(curve, start=1) if iql.report(trial, one, k)]
+
+    for height in (9.0, 8.0):
+        trial = iql.ask()
+        assert trial is not None
+        assert points(trial, height) == [], "too few trials"
+        iql.complete(trial, [height])
+    bad = iql.ask()
+    assert bad is not None
+    assert points(bad, 1.0)[0] == given_up_at
+    assert iql.report(bad, {"step": 1000.0, "eval/return": 1.0, "final/return": 1.0}, 5) == "", "it is at its end"
+
+
 def test_no_finite_return_ends_a_trial_and_counts(tmp_path: Path) -> None:
     def wild(one: Setting, seed: int) -> list[float]:
         late = [0.0, 1.0, 2.0, math.nan] if one.algo.kind == "vdn" else [0.0, math.inf, 2.0, 3.0]
@@ -528,7 +568,7 @@ def test_a_trial_that_raises_is_tried_in_the_next_launches_and_then_left(tmp_pat
     assert sum(arm_study.closed for arm_study in world.arm_studies()) == 10 - failed
     run = next(run for run in world.shelf if run.status == "failed")
     assert (run.tags["error"], run.tags["state"]) == ("ValueError: no such rate", "failed")
-    assert [world.launch(raising).trained for _ in range(ATTEMPTS)] == [failed] * (ATTEMPTS - 1) + [0]
+    assert [world.launch(raising).trained for _ in range(3)] == [failed, failed, 0], "three launches try it"
     assert {arm_study.left for arm_study in world.arm_studies()} == {0}
 
 
