@@ -144,6 +144,16 @@ def test_what_the_space_replaces_is_no_part_of_a_searchs_identity() -> None:
     assert other.identity("IQL") == first.identity("IQL")
 
 
+def test_what_the_space_replaces_in_a_block_is_no_part_of_it_either() -> None:
+    def identity(block: str) -> str:
+        arm = f"  RHMC: {{algo: {{kind: rhmc{block}}}, space: {{executor.gamma: {{low: 0.5, high: 0.9}}}}}}\n"
+        return load(changed("arms:\n", f"arms:\n{arm}")).identity("RHMC")
+
+    assert identity(", executor: {gamma: 0.7}") == identity("")
+    one = identity(", executor: {gamma: 0.7, epsilon: 0.1}")
+    assert one == identity(", executor: {epsilon: 0.1}") != identity(", executor: {epsilon: 0.2}")
+
+
 def test_the_digest_of_a_search_covers_what_it_includes() -> None:
     text, tuned = changed("algo: {kind: vdn,", "algo: {include: found/vdn,"), Path("studies/found/vdn.yaml")
     tuned.write_text("algo: {kind: vdn}\n")
