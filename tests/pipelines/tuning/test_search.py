@@ -781,6 +781,22 @@ def test_status_before_anything_ran_makes_nothing(tmp_path: Path, capsys: pytest
     assert not (tmp_path / "work").exists()
 
 
+def test_status_is_done_where_every_trial_is_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    world = World(load(), tmp_path)
+    world.launch()
+    monkeypatch.setattr("pipelines.tuning.search_run.opened", lambda place, write: nullcontext(world.storage))
+    best = world.arm_studies()[0].best()
+    assert best is not None
+    for trials, code, missing in ((5, 0, 0), (6, 1, 1), (3, 0, 0)):
+        assert show_search(load(GOOD, "quick", f"trials={trials}"), tmp_path) == code
+        out = capsys.readouterr().out
+        (row,) = (line.split() for line in out.splitlines() if line.split()[:2] == ["IQL", str(trials)])
+        assert row[2:] == ["5", "0", "0", "0", "0", str(missing), f"{best.value:.2f}", "0"]
+        assert f"IQL: final/return {best.value:.2f} over 2 seeds in trial {best.trial_index}: lr=" in out
+
+
 def test_trials_of_other_code_are_stale(tmp_path: Path) -> None:
     world = World(load(), tmp_path)
     world.launch()

@@ -207,3 +207,22 @@ def test_words_are_escaped_and_breaks_kept() -> None:
 @pytest.mark.parametrize(("seconds", "words"), [(0, "0 s"), (89, "89 s"), (95, "2 min"), (11_530, "3 h 12 min")])
 def test_durations(seconds: float, words: str) -> None:
     assert page.duration(seconds) == words
+
+
+GIF = bytes.fromhex("47494638396102000100800000ffffff00000021f90400000000002c00000000020001000002020c0a003b")
+
+
+@pytest.mark.parametrize(
+    ("gif", "whole"),
+    [
+        (GIF, True),
+        (b"GIF87a" + GIF[6:], True),
+        (b"GIF88a" + GIF[6:], False),
+        (GIF[:-1], False),
+        (GIF[:6] + bytes(2) + GIF[8:], False),
+        (GIF[:8] + bytes(2) + GIF[10:], False),
+        (b"", False),
+    ],
+)
+def test_what_is_a_whole_animation(gif: bytes, whole: bool) -> None:
+    assert page.animation_fault(gif) == ("" if whole else f"the file is not a whole GIF ({len(gif)} bytes)")
