@@ -376,3 +376,12 @@ def test_what_makes_a_verdict_provisional(tmp_path: Path, budget: int, seeds: in
     finals = {"full": noisy(70.5, seeds), "no regulation": noisy(35.6, seeds)}
     found = verdicts(tmp_path, study("ablation", finals, steps=budget))["C8"]
     assert (found.verdict, found.caveats, found.provisional) == ("reproduced", caveats, bool(caveats))
+
+
+def test_the_reason_of_c13_states_shares_and_the_largest_gap(tmp_path: Path) -> None:
+    found = verdicts(tmp_path / "lost", study("coverage", arms(70)), theorem(40))["C13"]
+    assert found.reason == (
+        "Below the optimum in 4.0 % to 8.0 % of random instances, by size and density, and by up to 1.10 of reward."
+    )
+    none = verdicts(tmp_path / "none", study("coverage", arms(70)), theorem(0))["C13"]
+    assert none.reason == "No loss in 2,000 instances."

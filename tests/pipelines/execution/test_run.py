@@ -457,6 +457,24 @@ def test_a_server_that_is_not_mlflow(
     assert message.count("\n") == 1
 
 
+@pytest.mark.parametrize(("done", "code"), [(0, 1), (1, 1), (2, 0)])
+def test_the_status_as_json_has_the_exit_code_of_the_table(
+    done: int, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tracker = MemoryTracker(study_card(tiny()), [])
+    for item in plan()[:done]:
+        tracker.start(item.card).finish("finished")
+    for name, value in (("own", True), ("remarks", [])):
+        monkeypatch.setattr(tracker, name, value, raising=False)
+    monkeypatch.setattr("pipelines.tracking.mlflow_tracker.open_existing", lambda *given: tracker)
+    assert show_status(tiny(), tmp_path) == code
+    capsys.readouterr()
+    assert show_status(tiny(), tmp_path, as_json=True) == code
+    told = json.loads(capsys.readouterr().out)
+    assert told["finished"] == (code == 0)
+    assert sum(arm["finished"] for arm in told["arms"].values()) == done
+
+
 def test_the_status_before_anything_ran(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert show_status(tiny(), tmp_path) == 1
     assert capsys.readouterr().out.splitlines()[1].split() == ["slow", "1", "0", "0", "0", "0", "1", "0"]

@@ -128,6 +128,24 @@ def test_the_reports_read_what_is_exported() -> None:
     assert {name: FORMS[name] for name in forms} == {name: tuple(schema.names) for name, schema in forms.items()}
 
 
+@pytest.mark.parametrize(("done", "code"), [(1, 1), (2, 0)])
+def test_half_a_study_is_written_and_has_its_exit_code(
+    done: int,
+    code: int,
+    tracker: MemoryTracker,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for item in plan()[:done]:
+        log(tracker, item)
+    monkeypatch.setattr("pipelines.tracking.mlflow_tracker.open_existing", lambda *given: tracker)
+    assert export_study(tiny(), tmp_path / "out", tmp_path / "none") == code
+    assert capsys.readouterr().err == ("tiny (quick): 1 of 2 runs are not finished\n" if code else "")
+    _, table = read(tmp_path / "out")
+    assert sorted(table.status) == sorted(["finished"] * done + ["missing"] * (2 - done))
+
+
 def test_nothing_logged_yet(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert export_study(tiny(), tmp_path / "out", tmp_path / "none") == 1
     assert "2 of 2 runs are not finished" in capsys.readouterr().err
