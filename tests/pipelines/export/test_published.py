@@ -203,8 +203,8 @@ def test_options_of_what_is_trained_anew(
         ]
 
     monkeypatch.setattr("pipelines.export.published.retrain", train)
-    assert verify("--retrain", "2", "--seed", "7", "--jobs", "5", *margin).code == code
-    assert asked == [(2, 7, 5)]
+    assert verify("--retrain", "3", "--seed", "7", "--jobs", "5", *margin).code == code
+    assert asked == [(3, 7, 5)]
 
 
 def test_a_published_run_whose_settings_are_not_its_own(exported: Path) -> None:
