@@ -1,5 +1,6 @@
 """The science: tasks, networks, methods and their training. Knows neither studies nor logs nor reports."""
 
-from rhmc.portable import apply
+from rhmc.portable import apply, keep_memory
 
 apply()
+keep_memory()

@@ -7,6 +7,7 @@ read the settings at their first operation, so importing `rhmc` before anything 
 compared, and where: `docs/reproducibility.md`.
 """
 
+import ctypes
 import os
 import platform
 from pathlib import Path
@@ -17,7 +18,10 @@ SETTINGS = {
     "ONEDNN_DEFAULT_FPMATH_MODE": "STRICT",  # products of `rhmc.networks.linear`: no numbers of fewer bits
 }
 CAPABILITY = "AVX2"  # what torch then says of itself
+X86 = platform.machine().lower() in {"x86_64", "amd64"}
 CPUINFO = Path("/proc/cpuinfo")
+KEPT = 1 << 30  # bytes of freed memory that a process keeps for its next tensors
+ALLOCATOR = {-1: KEPT, -3: KEPT}  # M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of malloc.h
 
 
 def apply() -> None:
@@ -26,9 +30,17 @@ def apply() -> None:
         os.environ.update(SETTINGS)
 
 
+def keep_memory() -> None:
+    """Let glibc keep freed memory, of which the kernel would clear each page anew. It changes no result."""
+    if platform.libc_ver()[0] == "glibc":
+        libc = ctypes.CDLL(None)
+        for parameter, value in ALLOCATOR.items():
+            libc.mallopt(parameter, value)
+
+
 def possible() -> bool:
     """Whether this processor has the instructions; results of another kind are its own."""
-    if platform.machine().lower() not in {"x86_64", "amd64"}:
+    if not X86:
         return False
     return not CPUINFO.exists() or {"avx2", "fma"} <= set(CPUINFO.read_text(encoding="utf-8").split())
 

@@ -45,7 +45,7 @@ ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
         "registry": (),
         "envs": ("types", "registry"),
         "yardsticks": ("envs",),
-        "networks": ("types",),
+        "networks": ("types", "portable"),
         "learning": ("types", "networks"),
         "hierarchy": ("types", "networks", "learning"),
         "algorithms": ("types", "registry", "networks", "learning", "hierarchy"),

@@ -62,7 +62,7 @@ def count(kind: str, encoder: str, env: EnvConfig) -> Count:
 def _learning(state: Any) -> int:
     """Numbers in the networks of all learners inside a checkpoint."""
     inner = state.values() if isinstance(state, dict) else state if isinstance(state, list) else ()
-    if isinstance(state, dict) and state.keys() == {"net", "slow", "optimiser"}:
+    if isinstance(state, dict) and state.keys() == {"net", "target_net", "optimiser"}:
         return sum(value.numel() for value in state["net"].values() if isinstance(value, Tensor))
     return sum(map(_learning, inner))
 

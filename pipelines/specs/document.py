@@ -352,7 +352,7 @@ def _fault(model: type[BaseModel], root: Node, error: ErrorDetails, hidden: tupl
         return Fault(node.key, path, "missing")
     if kind == "extra_forbidden":
         return Fault(node.key, path, _unknown(loc[-1], _model(model, error["loc"][:-1]), hidden))
-    if isinstance(node.value, str) and not rest:
+    if isinstance(node.value, str) and loc and not rest:
         block = renamed.block_hint(loc[-1], node.value, settings(_model(model, error["loc"][:-1])))
         if block:
             return Fault(node.place, path, block)

@@ -77,10 +77,13 @@ class Learner(Generic[Net]):
             group["lr"] = self.lr * left
 
     def update(self, loss: Tensor) -> Tensor:
-        """One step down `loss`; returns the norm of the gradient. Other networks in the loss are left alone."""
+        """One step down `loss`; returns the norm of the gradient. Other networks in the loss are left alone.
+
+        Gradients are laid in memory as their weights are: the fused optimiser reads both in the order of memory.
+        """
         grads = torch.autograd.grad(loss, self.params)
         for param, grad in zip(self.params, grads, strict=True):
-            param.grad = grad
+            param.grad = grad if grad.stride() == param.stride() else torch.empty_like(param).copy_(grad)
         norm = nn.utils.clip_grad_norm_(self.params, self.max_grad_norm, foreach=True)
         self.optimiser.step()
         if self.tau > 0:

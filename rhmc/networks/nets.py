@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import elu
 
-from rhmc.networks.linear import Linear
+from rhmc.networks.linear import MLP, Linear, stack
 from rhmc.types import Obs, Spec
 
 EncoderName = Literal["mlp", "pairwise"]
@@ -39,12 +39,12 @@ class Sizes(NamedTuple):
         )
 
 
-def mlp(*sizes: int) -> nn.Sequential:
+def mlp(*sizes: int) -> MLP:
     """Linear layers with ReLU between them; the last one is linear."""
     layers: list[nn.Module] = []
     for i, o in pairwise(sizes):
         layers += [Linear(i, o), nn.ReLU()]
-    return nn.Sequential(*layers[:-1])
+    return MLP(*layers[:-1])
 
 
 def append(obs: Obs, *, agent: Tensor | None = None, pair: Tensor | None = None) -> Obs:
@@ -130,11 +130,10 @@ class _PairBody(nn.Module):
         self.second = Linear(hidden, hidden)
 
     def forward(self, obs: Obs) -> Tensor:
-        rows = obs.pairs.shape[:3]
-        h = self.pair(obs.pairs.flatten(0, 2))  # rows: ReLU in place on a view would copy whole gradients
-        if self.agent is not None:
-            h = (h.unflatten(0, rows) + self.agent(obs.agents).unsqueeze(2)).flatten(0, 2)
-        return self.second(h.relu_()).relu_().unflatten(0, rows)
+        if self.agent is None:
+            return stack(obs.pairs, (self.pair, self.second), last="relu")
+        h = self.pair(obs.pairs) + self.agent(obs.agents).unsqueeze(2)
+        return stack(h.relu_(), (self.second,), last="relu")
 
 
 class _AgentBody(nn.Module):
@@ -147,10 +146,12 @@ class _AgentBody(nn.Module):
         self.width = 2 * hidden + sizes.agent + (2 * hidden if sizes.peer else 0)
 
     def forward(self, obs: Obs) -> Tensor:
-        parts = [_pool(self.pairs(obs), 2), obs.agents]
+        parts = [_pool(self.pairs(obs), 2)]
+        if obs.agents.shape[-1]:
+            parts.append(obs.agents)
         if self.peers is not None:
             parts.append(_pool(self.peers(obs.peers).relu(), 2))
-        return torch.cat(parts, -1)
+        return torch.cat(parts, -1) if len(parts) > 1 else parts[0]
 
 
 class PairwiseLocal(nn.Module):
@@ -323,8 +324,8 @@ class _MeanMax(torch.autograd.Function):
         by_mean, by_largest = grad.chunk(2, -1)
         is_largest = torch.threshold_(h - largest.unsqueeze(ctx.dim), LEAST, -1.0).add_(1.0)  # 1 or 0
         share = by_largest / is_largest.sum(ctx.dim)  # equals share
-        both = is_largest.mul_(share.unsqueeze(ctx.dim)).add_((by_mean / h.shape[ctx.dim]).unsqueeze(ctx.dim))
-        return both, None
+        mean = by_mean / h.shape[ctx.dim]
+        return torch.addcmul(mean.unsqueeze(ctx.dim), is_largest, share.unsqueeze(ctx.dim), out=is_largest), None
 
 
 def _repool(h: Tensor, new: Tensor, dim: int) -> Tensor:

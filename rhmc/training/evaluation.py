@@ -1,4 +1,4 @@
-"""Greedy evaluation on a fixed bank of episodes, with a generator of its own."""
+"""Greedy evaluation on fixed episodes, with a generator of its own."""
 
 from typing import NamedTuple
 
@@ -26,7 +26,7 @@ class Episodes(NamedTuple):
 
 @torch.no_grad()
 def evaluate(algorithm: Algorithm, cfg: EnvConfig, episodes: int, seed: int, device: str = "cpu") -> Episodes:
-    """Play `episodes` greedy episodes of the bank that `seed` names.
+    """Play `episodes` greedy episodes, those that `seed` names.
 
     Starts and the task's own randomness depend on the seed alone, so every method and every point of a curve meets the
     same episodes.

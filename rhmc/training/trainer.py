@@ -27,7 +27,7 @@ class Config(Frozen):
     evaluations: int = Field(100, ge=1, description="points of the curve after the one at step 0")
     eval_episodes: int = Field(100, ge=1)
     final_episodes: int = Field(500, ge=1)
-    eval_seed: int = Field(10_000_000, ge=0, description="names the bank of evaluation episodes")
+    eval_seed: int = Field(10_000_000, ge=0, description="names the evaluation episodes")
     device: str = "cpu"
     threads: int = Field(1, ge=1, description="torch threads; results of larger layers depend on it")
 
@@ -35,7 +35,7 @@ class Config(Frozen):
 class Trainer:
     """Iterator: each `next` trains to the next point of the grid, evaluates and returns metrics.
 
-    The first item is the untrained policy at step 0. The last one holds `final/...` from the larger bank.
+    The first item is the untrained policy at step 0. The last one holds `final/...` from more episodes.
 
     Args:
         env: the task.
@@ -76,12 +76,12 @@ class Trainer:
             raise StopIteration
         self.point += 1
         metrics = self._train(grid_step(self.cfg, self.point))
-        bank = evaluate(self.algorithm, self.env_cfg, self.cfg.eval_episodes, self.cfg.eval_seed, self.cfg.device)
-        metrics |= bank.means("eval")
+        played = evaluate(self.algorithm, self.env_cfg, self.cfg.eval_episodes, self.cfg.eval_seed, self.cfg.device)
+        metrics |= played.means("eval")
         if self.done:
             seed = self.cfg.eval_seed + 5_000_000
-            bank = evaluate(self.algorithm, self.env_cfg, self.cfg.final_episodes, seed, self.cfg.device)
-            metrics |= bank.means("final")
+            played = evaluate(self.algorithm, self.env_cfg, self.cfg.final_episodes, seed, self.cfg.device)
+            metrics |= played.means("final")
         return {"step": float(self.step)} | metrics
 
     def _train(self, until: int) -> Metrics:

@@ -1,7 +1,8 @@
 """The requirements on every method of the table, on both encoders and both tasks; and RHMC in its variants."""
 
+from collections.abc import Iterator
 from functools import cache
-from itertools import product
+from itertools import islice, product
 from operator import attrgetter
 from typing import Any, NamedTuple
 
@@ -64,7 +65,7 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {  # beside the defaults, on b
         "rhmc",
         {"assignment_period": 3, "coordinator.gradient": "counterfactual", "regulator": "exact"},
     ),
-    "hitmac period 3": ("hitmac", {"assignment_period": 3, "n_steps": 2}),
+    "hitmac period 3": ("hitmac", {"assignment_period": 3, "coordinator.n_steps": 2}),
     "mappo kl_adaptive": ("mappo", {"objective": "kl_adaptive"}),
     "coma critic": ("coma", {"advantage_estimator": "critic"}),
 }
@@ -145,15 +146,18 @@ def whole(case: Case) -> Whole:
 
 @every
 def test_a_run_continues_from_any_point_bit_for_bit(case: Case) -> None:
-    """In a fresh trainer of another seed, so that nothing can come from anywhere but the checkpoint."""
+    """In a fresh trainer of another seed, so that nothing can come from anywhere but the checkpoint.
+
+    From each point to the next, and from the first to the end: as whole states are compared, so is all that follows.
+    """
     full = whole(case)
+    last = len(full.states) - 1
     for point, state in enumerate(full.states[:-1]):
-        run = trainer(case, seed=99)
+        run, end = trainer(case, seed=99), last if point == 0 else point + 1
         run.load_state_dict(through_a_file(state))  # a copy: what training changes in place is looked at again
         assert assert_same(run.state_dict(), state) > 40
-        rest = list(run)
-        assert rest == full.metrics[point + 1 :]
-        assert_same(run.state_dict(), full.states[-1])
+        assert list(islice(run, end - point)) == full.metrics[point + 1 : end + 1]
+        assert_same(run.state_dict(), full.states[end])
 
 
 @basic
@@ -181,7 +185,7 @@ def test_the_runs_that_are_resumed_go_through_what_they_should(case: Case) -> No
     if decided := [kept["count"].tolist() for state in algorithms for kept in having(state, {"rows", "count"})]:
         assert [] in decided
         assert [1] * 4 in decided
-    nets = [having(state, {"net", "slow", "optimiser"}) for state in algorithms]
+    nets = [having(state, {"net", "target_net", "optimiser"}) for state in algorithms]
     assert len(nets[0]) == len(learners(trainer(case).algorithm)) > 0
     for before, after in zip(nets[0], nets[-1], strict=True):
         assert not any(torch.equal(value, after["net"][key]) for key, value in before["net"].items() if value.dim() > 1)
@@ -614,7 +618,7 @@ def test_a_terminal_row_is_worth_its_reward(case: Case) -> None:
 ON_POLICY = {
     name: case
     for name, case in ONE_STEP.items()
-    if any(name.endswith("n_steps") for name in fields(type(case.algo))) and getattr(case.algo, "pretrain", 0) == 0
+    if {"n_steps", "coordinator.n_steps"} & set(fields(type(case.algo))) and getattr(case.algo, "pretrain", 0) == 0
 }
 
 
@@ -668,25 +672,31 @@ LEARNING_OF: dict[str, dict[str, Any]] = {  # what a method needs beside or inst
 STEPS = {"coma": 18_000, "hitmac": 14_000}  # 12 000 else
 
 
-def returns(kind: str, **changes: Any) -> list[float]:
-    """A method's mean return in the tiny task before and after learning."""
+def returns(kind: str, **changes: Any) -> Iterator[float]:
+    """A method's mean return in the tiny task before learning and at each sixth of its steps."""
     config = ALGORITHMS[kind].config
     wanted = LEARNING | LEARNING_OF.get(kind, {})
     known = fitted(config, wanted)
     run = Trainer(
         toy.Config(),  # type: ignore[arg-type]
         config(**nested(known | changes)),
-        Config(steps=STEPS.get(kind, 12_000), num_envs=32, evaluations=1, eval_episodes=300, final_episodes=1),
+        Config(steps=STEPS.get(kind, 12_000), num_envs=32, evaluations=6, eval_episodes=300, final_episodes=1),
         seed=0,
     )
-    return [item["eval/return"] for item in run]
+    return (item["eval/return"] for item in run)
 
 
-def assert_learned(found: list[float]) -> None:
-    """To 85 % of what two agents earn that go for a target each; acting at random earns about a third of it."""
-    first, last = found
-    assert first < 0.5 * toy.own_target()
-    assert last > 0.85 * toy.own_target()
+def assert_learned(found: Iterator[float]) -> None:
+    """To 85 % of what two agents earn that go for a target each; acting at random earns about a third of it.
+
+    A run that is clearly above that before its last step need not go on.
+    """
+    best = toy.own_target()
+    assert next(found) < 0.5 * best
+    for last in found:
+        if last > 0.9 * best:
+            break
+    assert last > 0.85 * best
 
 
 @pytest.mark.parametrize("encoder", ["mlp", "pairwise"])

@@ -159,9 +159,9 @@ def test_arms_that_look_alike_are_refused(one: str, other: str) -> None:
 
 
 def test_variants_that_look_alike_are_refused() -> None:
-    more = "variants: {paper_faithful: {algo: {lr: 0.1}}, Letter: {algo: {lr: 0.2}}}\n"
+    more = "variants: {faithful: {algo: {lr: 0.1}}, Faithful: {algo: {lr: 0.2}}}\n"
     (said,) = faults(written(["a"], more=more))
-    assert "'Letter' differs from variant 'letter' in case" in said
+    assert "'Faithful' differs from variant 'faithful' in case" in said
 
 
 @pytest.mark.parametrize("name", [*RESERVED, "Transfer", "THEOREM"])
@@ -479,7 +479,7 @@ def test_a_nul_in_the_path_of_an_include() -> None:
     Path("studies/x.yaml").write_text(FILE % '  a: {algo: {include: "a\\0b"}}')
     (line,) = rhmc("study", "check", "studies/x.yaml").err.splitlines()
     assert line.startswith(
-        "studies/x.yaml:4:23: arms.a.algo.include: studies/a\N{REPLACEMENT CHARACTER}b: no such file"
+        "studies/x.yaml:4:23: arms.a.algo.include: studies/a\N{REPLACEMENT CHARACTER}b.yaml: no such file"
     )
 
 

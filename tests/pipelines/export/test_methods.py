@@ -78,8 +78,8 @@ def test_what_is_counted_is_what_acts(monkeypatch: pytest.MonkeyPatch) -> None:
             self.asked(self.asked(torch.zeros(1, 2))[:, :2])
 
         def state_dict(self) -> dict[str, Any]:
-            learner = {"net": self.other.state_dict(), "slow": self.other.state_dict(), "optimiser": {}}
-            return {"two": [learner, {"net": self.asked.state_dict(), "slow": {}, "optimiser": {}}], "rng": 1}
+            learner = {"net": self.other.state_dict(), "target_net": self.other.state_dict(), "optimiser": {}}
+            return {"two": [learner, {"net": self.asked.state_dict(), "target_net": {}, "optimiser": {}}], "rng": 1}
 
     monkeypatch.setitem(ALGORITHMS, "iql", ALGORITHMS["iql"]._replace(build=Twice))
     assert count("iql", "mlp", TASKS[1]) == (9, 9 + 42)

@@ -118,12 +118,13 @@ def test_a_task_may_be_included_as_well() -> None:
         (
             "  alpha: 0.3",
             "  include: other.yaml",
-            "4:12: algo.include: studies/found/other.yaml: no such file",
+            "4:12: algo.include: studies/best_params/other.yaml: no such file",
         ),
         (
             "  alpha: 0.3",
-            "  include: found/rhmc",
-            "4:12: algo.include: studies/found/rhmc.yaml: includes itself, by way of studies/found/rhmc.yaml",
+            "  include: best_params/rhmc",
+            "4:12: algo.include: studies/best_params/rhmc.yaml: includes itself, "
+            "by way of studies/best_params/rhmc.yaml",
         ),
     ],
 )
@@ -189,7 +190,7 @@ def test_another_kind_must_state_what_all_have_in_common_also_when_included() ->
 
 def test_an_included_file_may_include_others() -> None:
     write("tuned", "algo:\n  kind: rhmc\n  horizon: 5\n  alpha: 0.3\n  lr: 2e-3\n")
-    write("rhmc", "algo:\n  include: found/tuned\n  horizon: 2\n")
+    write("rhmc", "algo:\n  include: best_params/tuned\n  horizon: 2\n")
     algo = load().arms["found"].algo
     assert (algo.horizon, algo.alpha, algo.lr) == (4, 0.3, 2e-3)
     assert load(GOOD.replace(", horizon: 4", "")).arms["found"].algo.horizon == 2
@@ -198,53 +199,56 @@ def test_an_included_file_may_include_others() -> None:
 def test_a_fault_is_named_in_the_file_that_an_included_one_includes() -> None:
     write("tuned", "algo:\n  kind: rhmc\n  alpha: 3\n")
     write("rhmc", "algo:\n  include: tuned\n  horizon: 2\n")  # beside itself
-    said = (
-        "studies/found/tuned.yaml:3:10: algo.alpha: 3 is not allowed; must be less than or equal to 1 (in arm 'found')"
-    )
-    assert faults() == [said]
+    said = "algo.alpha: 3 is not allowed; must be less than or equal to 1 (in arm 'found')"
+    assert faults() == [f"studies/best_params/tuned.yaml:3:10: {said}"]
     write("tuned", "algo:\n  kind: qmix\n")
     write("rhmc", "algo:\n  include: tuned\n  kind: rhmc\n")
-    said = "studies/found/rhmc.yaml:3:9: algo.kind: 'rhmc' is not allowed; what is included here is of kind 'qmix'"
+    said = (
+        "studies/best_params/rhmc.yaml:3:9: algo.kind: 'rhmc' is not allowed; what is included here is of kind 'qmix'"
+    )
     assert said in faults()
 
 
 def test_files_that_include_each_other_are_a_fault() -> None:
     write("rhmc", "algo:\n  include: tuned\n")
-    write("tuned", "algo:\n  include: ../found/rhmc\n")
-    said = "algo.include: studies/found/../found/rhmc.yaml: includes itself, by way of studies/found/tuned.yaml"
-    assert f"studies/found/tuned.yaml:2:12: {said}" in faults()
+    write("tuned", "algo:\n  include: ../best_params/rhmc\n")
+    tuned = "studies/best_params/tuned.yaml"
+    said = f"studies/best_params/../best_params/rhmc.yaml: includes itself, by way of {tuned}"
+    assert f"{tuned}:2:12: algo.include: {said}" in faults()
     assert len(closure(Path("studies/x.yaml"))) == 4
 
 
 def test_a_name_is_looked_for_beside_the_file_then_in_the_project_then_in_the_package() -> None:
     Path("mine").mkdir()
-    Path("mine/x.yaml").write_text(changed("found/qmix.yaml", "settings/coverage/qmix"))
+    Path("mine/x.yaml").write_text(changed("best_params/qmix.yaml", "settings/coverage/qmix"))
     study = Study.load("mine/x.yaml")
     assert study.arms["found"].algo.alpha == pytest.approx(0.3)  # of the project
     shipped = Study.load(SHIPPED / "coverage.yaml").arms["QMIX"].algo
     assert study.arms["QMIX"].algo == shipped
-    Path("mine/found").mkdir()
-    Path("mine/found/rhmc.yaml").write_text(changed("alpha: 0.3", "alpha: 0.4", RHMC))
+    Path("mine/best_params").mkdir()
+    Path("mine/best_params/rhmc.yaml").write_text(changed("alpha: 0.3", "alpha: 0.4", RHMC))
     assert Study.load("mine/x.yaml").arms["found"].algo.alpha == pytest.approx(0.4)
 
 
 def test_settings_of_ones_own_go_before_those_of_the_package_also_where_these_include_them() -> None:
     Path("mine/settings/coverage").mkdir(parents=True)
     Path("mine/settings/coverage/rhmc.yaml").write_text(RHMC)
-    Path("mine/x.yaml").write_text(changed("found/rhmc.yaml", "settings/navigation/rhmc"))
+    Path("mine/x.yaml").write_text(changed("best_params/rhmc.yaml", "settings/navigation/rhmc"))
     assert Study.load("mine/x.yaml").arms["found"].algo.alpha == pytest.approx(0.3)
 
 
 def test_a_name_that_is_not_found_has_a_suggestion_from_the_package() -> None:
-    lines = faults(changed("found/qmix.yaml", "settings/coverage/qmx"))
+    lines = faults(changed("best_params/qmix.yaml", "settings/coverage/qmx"))
     said = "studies/settings/coverage/qmx.yaml: no such file; did you mean 'settings/coverage/qmix'?"
     assert f"studies/x.yaml:8:26: arms.QMIX.algo.include: {said}" in lines
 
 
 def test_all_that_a_study_includes_is_known() -> None:
     write("tuned", "algo:\n  kind: rhmc\n")
-    write("rhmc", "algo:\n  include: found/tuned\n")
+    write("rhmc", "algo:\n  include: best_params/tuned\n")
     Path("studies/x.yaml").write_text(GOOD)
     names = [path.as_posix() for path in closure(Path("studies/x.yaml"))]
-    assert names == [f"studies/{name}.yaml" for name in ("x", "found/rhmc", "found/qmix", "found/tuned")]
+    assert names == [
+        f"studies/{name}.yaml" for name in ("x", "best_params/rhmc", "best_params/qmix", "best_params/tuned")
+    ]
     assert closure(Path("studies/none.yaml")) == []

@@ -16,7 +16,7 @@ from tests.test_architecture import is_search
 
 ROOT = Path(__file__).parents[3]
 STUDIES = ROOT / "studies"
-FILES = sorted(path for path in STUDIES.rglob("*.yaml") if path.parent.name != "found")  # a search writes those whole
+FILES = sorted(path for path in STUDIES.rglob("*.yaml") if path.parent.name != "best_params")  # searches write those
 ALIKE = 3  # settings that two sections may share by chance
 LINES = 400
 
@@ -78,7 +78,13 @@ def written_out(tree: Any, section: str = "") -> Any:
     if "include" not in tree:
         return tree
     name = str(tree.pop("include")).removesuffix(".yaml")
-    return written_out(document(STUDIES / f"{name}.yaml")[section], section) | tree
+    return merged(written_out(document(STUDIES / f"{name}.yaml")[section], section), tree)
+
+
+def merged(base: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
+    """The change before the base, in blocks too."""
+    blocks = {key for key in base.keys() & change.keys() if isinstance(base[key], dict)}
+    return base | change | {key: merged(base[key], change[key]) for key in blocks}
 
 
 @pytest.mark.parametrize("path", sorted(STUDIES.glob("*.yaml")), ids=lambda p: p.stem)

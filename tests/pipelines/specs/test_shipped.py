@@ -36,8 +36,8 @@ def test_what_a_study_includes_comes_with_it_and_nothing_else(tmp_path: Path) ->
 def test_a_copied_study_takes_what_was_copied_with_it(tmp_path: Path) -> None:
     file, *others = copy("navigation", tmp_path / "mine")
     (tuned,) = [path for path in others if path.parts[-2:] == ("coverage", "rhmc.yaml")]
-    tuned.write_text(tuned.read_text(encoding="utf-8") + "  flip: 0.25\n", encoding="utf-8")
-    assert Study.load(file).arms["RHMC"].algo.flip == 0.25
+    tuned.write_text(tuned.read_text(encoding="utf-8") + "  share: false\n", encoding="utf-8")
+    assert Study.load(file).arms["RHMC"].algo.share is False
 
 
 def test_a_file_that_is_there_is_left_alone(tmp_path: Path) -> None:

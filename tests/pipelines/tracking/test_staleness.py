@@ -74,7 +74,7 @@ def test_runs_of_one_reason_are_one_line_and_many_settings_are_cut() -> None:
     assert line.startswith("stale: arm 'one', 3 runs: other settings: algo.batch_size was 31, now 32, ")
     assert line.endswith(" and 1 more")
     tracker = MemoryTracker(study_card(study), [])
-    log(tracker, changed(items(study)[0], gamma=0.5, hidden=17, batch=31, buffer=401))
+    log(tracker, changed(items(study)[0], gamma=0.5, hidden_dim=17, batch_size=31, buffer_size=401))
     (line,) = reasons(items(study), tracker.recorded(), tracker)
     assert line.endswith("algo.hidden_dim was 17, now 16"), "all four are named"
 

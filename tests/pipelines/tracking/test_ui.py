@@ -20,6 +20,7 @@ from pipelines.tracking.plan import study_card
 from pipelines.tracking.tracker import Card, MemoryRun, MemoryTracker, StudyCard, points_of
 from pipelines.workspace.work_folder import Home
 from rhmc.algorithms import ALGORITHMS
+from tests.blocks import fitted, nested
 from tests.pipelines.support import plan, setting, tiny
 
 PARAMS = {"iql": ["algo.lr", "seed"], "rhmc": ["algo.lr", "algo.alpha", "seed"]}
@@ -152,8 +153,9 @@ def test_what_varies_is_told_by_method() -> None:
 
 def of_kind(kind: str, **algo: Any) -> Setting:
     """The tiny task with another method."""
-    config = ALGORITHMS[kind].config.model_validate({"kind": kind, "learning_starts": 64, "batch_size": 32, **algo})
-    return setting().model_copy(update={"algo": config})
+    config = ALGORITHMS[kind].config
+    few = fitted(config, {"learning_starts": 64, "batch_size": 32})
+    return setting().model_copy(update={"algo": config.model_validate({"kind": kind, **nested(few), **algo})})
 
 
 def seen(text: str) -> str:

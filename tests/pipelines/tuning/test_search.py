@@ -155,7 +155,8 @@ def test_what_the_space_replaces_in_a_block_is_no_part_of_it_either() -> None:
 
 
 def test_the_digest_of_a_search_covers_what_it_includes() -> None:
-    text, tuned = changed("algo: {kind: vdn,", "algo: {include: found/vdn,"), Path("studies/found/vdn.yaml")
+    text, tuned = changed("algo: {kind: vdn,", "algo: {include: best_params/vdn,"), Path("studies/best_params/vdn.yaml")
+    tuned.parent.mkdir(exist_ok=True)
     tuned.write_text("algo: {kind: vdn}\n")
     first = load(text).sha256
     tuned.write_text("algo: {kind: vdn} # again\n")

@@ -70,7 +70,7 @@ def test_a_description_that_is_refused_is_said_once(said: io.StringIO, tmp_path:
     ]
 
 
-@pytest.mark.parametrize(("module", "name"), [(overview, "figure"), (overview.legend, "colour")])
+@pytest.mark.parametrize(("module", "name"), [(overview, "figure"), (overview.arm_colours, "colour")])
 def test_a_figure_that_fails_leaves_the_rest(
     module: Any, name: str, said: io.StringIO, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -150,8 +150,8 @@ def test_a_board_that_cannot_be_made(capsys: pytest.CaptureFixture[str]) -> None
 def test_a_colour_and_a_view_that_fail(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(mlflow_tracker.legend, "legend", fails)
-    monkeypatch.setattr(mlflow_tracker.views, "views", fails)
+    monkeypatch.setattr(mlflow_tracker.arm_colours, "legend", fails)
+    monkeypatch.setattr(mlflow_tracker.saved_views, "views", fails)
     home = Home(tmp_path)
     home.prepare()
     tracker = mlflow_tracker.MlflowTracker(study_card(tiny()), home)

@@ -2,6 +2,7 @@
 
 from collections import deque
 from copy import deepcopy
+from typing import Any
 
 import pytest
 import torch
@@ -127,6 +128,28 @@ def test_the_slow_copy_follows_by_the_share_not_kept() -> None:
         slow = [0.75 * s + 0.25 * f for s, f in zip(slow, fast, strict=True)]
         assert all(torch.allclose(a, b, atol=1e-7) for a, b in zip(params(learner.target_net), slow, strict=True))
         assert not any(torch.equal(a, b) for a, b in zip(fast, params(learner.target_net), strict=True))
+
+
+class Transposed(torch.autograd.Function):
+    """The identity, with a gradient that lies in memory by columns."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        return x.clone()
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        return grad.t().contiguous().t()
+
+
+def test_a_step_does_not_depend_on_how_gradients_lie_in_memory() -> None:
+    """The fused optimiser takes the numbers of both in the order of memory."""
+    mine, other = (Learner(net(), lr=0.1) for _ in range(2))
+    for learner, through in ((mine, Transposed.apply), (other, Tensor.clone)):
+        first = learner.net[0]
+        hidden = nn.functional.linear(INPUT, through(first.weight), first.bias)
+        learner.update(learner.net[2](hidden.tanh()).square().mean())
+    assert all(torch.equal(a, b) for a, b in zip(params(mine.net), params(other.net), strict=True))
 
 
 @pytest.mark.parametrize(("tau", "follows"), [(0.0, False), (1.0, True)])

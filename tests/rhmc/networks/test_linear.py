@@ -1,14 +1,17 @@
 """Linear layers against chains of fused multiply-adds, and their derivatives against torch's own."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
+from torch.nn.modules.module import register_module_forward_hook
 
-from rhmc.networks.linear import Linear, linear, product
-from rhmc.networks.nets import _pool
+from rhmc.networks.linear import Linear, _outer, linear, product, stack
+from rhmc.networks.nets import _pool, mlp
 from tests.oracles import products
 
 
@@ -32,6 +35,20 @@ def test_a_product_is_a_chain_of_fused_multiply_adds(m: int, k: int, n: int, see
 def test_a_long_sum_is_one_of_blocks(k: int) -> None:
     """As the gradients of weights are."""
     assert_chain(64, k, 10)
+
+
+@pytest.mark.parametrize("rows", [2, 300, 512, 513, 514, 1024, 1300, 2561])
+@pytest.mark.parametrize(("outputs", "inputs"), [(64, 10), (10, 64), (3, 20), (2, 2)])
+def test_the_gradient_of_weights_is_a_sum_of_blocks_of_rows(rows: int, outputs: int, inputs: int) -> None:
+    grad, x = uniform(rows, outputs), uniform(rows, inputs, seed=1)
+    if rows % 512 == 1:  # the last row is a block of its own
+        rest = grad[-1:].numpy().T * x[-1:].numpy()
+        wanted = products.product(grad[:-1].numpy().T, x[:-1].numpy().T) + rest
+    else:
+        wanted = products.product(grad.numpy().T, x.numpy().T)
+    assert np.array_equal(_outer(grad, x).numpy(), wanted)
+    wide = torch.cat((grad, grad), 1)[:, :outputs], torch.cat((x, x), 1)[:, :inputs]
+    assert torch.equal(_outer(*wide), _outer(grad, x))
 
 
 def test_a_product_does_not_depend_on_how_its_factors_lie_in_memory() -> None:
@@ -78,6 +95,53 @@ def test_derivatives_nobody_asks_for_are_not_computed() -> None:
     x, w = uniform(3, 6), uniform(4, 6).requires_grad_()
     (found,) = torch.autograd.grad(linear(x, w, None).sum(), [w])
     assert torch.allclose(found, x.sum(0).expand(4, 6))
+
+
+@pytest.mark.parametrize("sizes", [(10, 64, 3), (10, 64, 32, 1), (5, 4)])
+@pytest.mark.parametrize("by_input", [True, False])
+def test_layers_computed_at_once_give_what_one_after_the_other_gives(sizes: tuple[int, ...], by_input: bool) -> None:
+    """Values, and derivatives of inputs and weights, to the last bit; the gradient that comes in is left alone."""
+    torch.manual_seed(5)
+    net = mlp(*sizes)
+    x, grad = uniform(600, 2, sizes[0]).requires_grad_(by_input), uniform(600, 2, sizes[-1], seed=1)
+    given = [*([x] if by_input else []), *net.parameters()]
+    single = x
+    for layer in net:
+        single = layer(single)
+    together, kept = net(x), grad.clone()
+    assert torch.equal(together, single)
+    with torch.no_grad():
+        assert torch.equal(net(x), single)
+    found, wanted = (torch.autograd.grad(y, given, grad) for y in (together, single))
+    assert all(torch.equal(a, b) for a, b in zip(found, wanted, strict=True))
+    assert torch.equal(grad, kept)
+
+
+@pytest.mark.parametrize("every", [False, True])
+def test_a_hook_sees_each_layer_and_changes_no_byte(every: bool) -> None:
+    """A hook of one layer, or one of all modules; and where layers stand in no `MLP`."""
+    net, x = mlp(5, 8, 8, 3), torch.randn(7, 5)
+    expected, seen = (net(x), stack(x, [*net][::2], last="relu")), []
+
+    def note(module: nn.Module, inputs: Any, output: Tensor) -> None:
+        if module is net[2]:
+            seen.append(output.detach())
+
+    handle = register_module_forward_hook(note) if every else net[2].register_forward_hook(note)
+    watched = net(x), stack(x, [*net][::2], last="relu")
+    handle.remove()
+    assert all(torch.equal(a, b) for a, b in zip(watched, expected, strict=True))
+    assert len(seen) == 2
+    assert torch.equal(seen[0], seen[1])
+    net(x)
+    assert len(seen) == 2
+
+
+def test_a_rectified_end_leaves_the_gradient_that_comes_in_alone() -> None:
+    layer, x, grad = Linear(6, 4), uniform(8, 6), uniform(8, 4, seed=1)
+    (found,) = torch.autograd.grad(stack(x, [layer], last="relu"), [layer.weight], grad)
+    assert torch.equal(grad, uniform(8, 4, seed=1))
+    assert torch.equal(found, torch.autograd.grad(layer(x).relu(), [layer.weight], grad)[0])
 
 
 @pytest.mark.parametrize("dim", [1, 2])
