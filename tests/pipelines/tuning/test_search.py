@@ -508,6 +508,23 @@ def test_a_pruned_trial_never_wins_and_of_equals_the_earliest_does(tmp_path: Pat
     assert (iql.closed, iql.left) == (4, 1)
 
 
+def test_the_earliest_of_equals_is_the_first_of_the_budget_whenever_it_was_tried(tmp_path: Path) -> None:
+    (iql, _) = World(load(), tmp_path).arm_studies()
+    died = iql.study.ask()  # before it had its values, while another was asked for
+    died.set_user_attr("trial_index", 0)
+    second = iql.ask()
+    iql.study.tell(died, state=optuna.trial.TrialState.FAIL)
+    first = iql.ask()
+    assert first is not None
+    assert second is not None
+    assert (first.trial_index, second.trial_index) == (0, 1)
+    for trial in (second, first):
+        iql.complete(trial, [4.0, 4.0])
+    best = iql.best()
+    assert best is not None
+    assert best.trial_index == 0
+
+
 @pytest.mark.parametrize(("warmup", "given_up_at"), [(1, 1), (2, 2), (3, 3)])
 def test_the_pruner_waits_for_its_points_and_trials(tmp_path: Path, warmup: int, given_up_at: int) -> None:
     """Two good trials, of which the median is made, then one that is bad from the start."""
