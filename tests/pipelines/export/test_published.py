@@ -15,10 +15,10 @@ from pipelines.export.published import folder, publish, retrain
 from pipelines.export.tables import VERSION, write_tables
 from pipelines.specs.study import Study
 from pipelines.tracking.plan import items, study_card
-from pipelines.tracking.tracker import MemoryTracker
 from pipelines.workspace.errors import InputError
 from reports.analyses.equivalence import read
 from rhmc.training.trainer import Trainer
+from tests.memory_tracker import MemoryTracker
 from tests.pipelines.support import setting, tiny
 
 STUDY = tiny(arms={"slow": setting(lr=1e-4), "fast": setting(lr=1e-2)}).model_copy(update={"seeds": 2})

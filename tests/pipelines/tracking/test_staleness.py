@@ -6,8 +6,9 @@ from pipelines.specs.study import RunSpec
 from pipelines.tracking.mlflow_tracker import MlflowTracker
 from pipelines.tracking.plan import Item, items, resolved_yaml, study_card
 from pipelines.tracking.staleness import reasons
-from pipelines.tracking.tracker import MemoryTracker, Tracker
+from pipelines.tracking.tracker import Tracker
 from pipelines.workspace.work_folder import Home
+from tests.memory_tracker import MemoryTracker
 from tests.pipelines.support import setting, tiny
 
 STUDY = tiny()

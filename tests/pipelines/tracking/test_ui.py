@@ -17,10 +17,11 @@ from pipelines.tracking import arm_colours, mlflow_tracker, overview, saved_view
 from pipelines.tracking.mlflow_tracker import MlflowTracker, addresses
 from pipelines.tracking.overview import Overview, Run, figure, so_far, table
 from pipelines.tracking.plan import study_card
-from pipelines.tracking.tracker import Card, MemoryRun, MemoryTracker, StudyCard, points_of
+from pipelines.tracking.tracker import Card, StudyCard, points_of
 from pipelines.workspace.work_folder import Home
 from rhmc.algorithms import ALGORITHMS
 from tests.blocks import fitted, nested
+from tests.memory_tracker import MemoryRun, MemoryTracker
 from tests.pipelines.support import plan, setting, tiny
 
 PARAMS = {"iql": ["algo.lr", "seed"], "rhmc": ["algo.lr", "algo.alpha", "seed"]}

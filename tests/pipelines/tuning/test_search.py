@@ -32,7 +32,7 @@ from pipelines.execution.trainable import ending
 from pipelines.specs.search import EVAL_SEED, FIRST_SEED, Dimension, Search
 from pipelines.specs.study import Setting, Study, StudyError
 from pipelines.tracking.mlflow_tracker import open_existing
-from pipelines.tracking.tracker import MemoryRun, MemoryTracker, points_of
+from pipelines.tracking.tracker import points_of
 from pipelines.tuning import ray_workers
 from pipelines.tuning.best_params import file_name, winner_yaml
 from pipelines.tuning.ray_workers import Failed
@@ -41,6 +41,7 @@ from pipelines.tuning.search_run import Drive, TrialLog, results, run_search, se
 from pipelines.tuning.trials import ATTEMPTS, ArmStudy, look, open_storage
 from pipelines.workspace.work_folder import Home, StoreError
 from rhmc.training.trainer import Trainer
+from tests.memory_tracker import MemoryRun, MemoryTracker
 from tests.pipelines.execution.test_trainable import same
 from tests.pipelines.support import CODE, interrupt, setting
 from tests.robustness.killed import PoolHere
