@@ -341,13 +341,22 @@ def test_an_interrupt_is_130(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> Non
     assert rhmc("study", "run", "studies/x.yaml").code == 130
 
 
-@pytest.mark.parametrize("options", [["--profile", "paper"], ["--profile", "quick", "--runs", "a", "--out", "b"]])
-def test_report_hands_on_its_options(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch, options: list[str]) -> None:
-    calls: list[list[str]] = []
-    build = SimpleNamespace(main=lambda given, shown: calls.append(given) or 2)
+@pytest.mark.parametrize(
+    ("options", "given"),
+    [
+        (["--profile", "paper"], (None, None, "paper", None)),
+        (["--runs", "a", "--out", "b"], (Path("a"), Path("b"), "quick", None)),
+        (["--study", "studies/x.yaml", "--variant", "far"], (None, None, "quick", "x@far")),
+    ],
+)
+def test_report_hands_on_its_options(
+    rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch, options: list[str], given: tuple[object, ...]
+) -> None:
+    calls: list[tuple[object, ...]] = []
+    build = SimpleNamespace(write_report=lambda *given: calls.append(given[:4]) or 2)
     monkeypatch.setitem(sys.modules, "reports.pages.build", build)
     assert rhmc("report", *options).code == 2
-    assert calls == [options]
+    assert calls == [given]
 
 
 # Yardsticks
