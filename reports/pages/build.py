@@ -461,7 +461,8 @@ def _summary(results: Results) -> str:
         said = f"{done} of {len(plan)} runs finished, {steps(budget) if budget else 'unknown'} steps each"
         episodes = results.final_episodes(study)
         said += f", final return over {episodes} episodes" if episodes else ""
-        lines.append(f"- **{markdown(study)}**: {prose(question)} ({len(results.arms(study))} arms, {said})")
+        arms = len(results.arms(study))
+        lines.append(f"- **{markdown(study)}**: {prose(question)} ({arms} arm{'s' * (arms > 1)}, {said})")
     return "\n".join(lines) or "No study has runs yet."
 
 
