@@ -16,6 +16,7 @@ from rhmc.types import Metrics
 VALUES_ONLY = "values_only"  # tag of a run that came from a bundle without its policy
 Status = Literal["running", "finished", "failed", "interrupted"]
 ADOPTED = "adopted"  # tag of a run that other code made: which, and what was compared
+FROM = "from code "  # begins the tag; the code and `:` follow
 
 
 class StudyCard(NamedTuple):
@@ -69,6 +70,21 @@ class Recorded(NamedTuple):
     values_only: bool = False  # taken in from a bundle without policies
     modules: Mapping[str, str] = MappingProxyType({})  # of the code that made it, where that was kept
     adopted: str = ""  # from which code, and what was compared, if another code made it
+
+    @property
+    def spec_id(self) -> str:
+        """The identity of its settings when it was made."""
+        return self.key.partition("-")[0]
+
+    @property
+    def code(self) -> str:
+        """The fingerprint of the code that it is logged under."""
+        return self.key.rpartition("-")[2]
+
+    @property
+    def copied_from(self) -> str:
+        """The code of the run that this one is an adopted copy of; empty if it is none."""
+        return self.adopted.removeprefix(FROM).partition(":")[0]
 
 
 class Row(NamedTuple):

@@ -56,7 +56,7 @@ def planted(tracker: MemoryTracker, arm: str, step: int, metric: str) -> tuple[f
 
 
 def arms(found: Mapping[str, Sequence[Older]]) -> dict[str, list[str]]:
-    return {arm: [one.code for one in some] for arm, some in found.items()}
+    return {arm: [one.run.code for one in some] for arm, some in found.items()}
 
 
 def test_what_can_be_adopted_is_what_is_finished_under_other_code() -> None:
