@@ -23,7 +23,6 @@ from optuna.storages import InMemoryStorage
 from rich.console import Console
 from ruamel.yaml import YAML
 
-from pipelines.cli import main as cli
 from pipelines.execution import ray_driver
 from pipelines.execution.finite import DivergedError
 from pipelines.execution.progress import PlainBoard
@@ -43,7 +42,7 @@ from pipelines.workspace.work_folder import Home, StoreError
 from rhmc.training.trainer import Trainer
 from tests.memory_tracker import MemoryRun, MemoryTracker
 from tests.pipelines.execution.test_trainable import same
-from tests.pipelines.support import CODE, interrupt, setting
+from tests.pipelines.support import CODE, Said, interrupt, run_rhmc, setting
 from tests.robustness.killed import PoolHere
 from tests.support import changing
 
@@ -746,7 +745,7 @@ def test_trials_of_other_code_are_stale(tmp_path: Path) -> None:
 
 # The command
 
-Rhmc = Callable[..., tuple[int, str, str]]
+Rhmc = Callable[..., Said]
 
 
 @pytest.fixture
@@ -755,12 +754,8 @@ def rhmc(project: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFi
     load()
     monkeypatch.setenv("RHMC_HOME", str(project / "work"))
 
-    def call(*words: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["rhmc", "search", *words])
-        with pytest.raises(SystemExit) as caught:
-            cli.main()
-        out, err = capfd.readouterr()
-        return int(caught.value.code or 0), out, err
+    def call(*words: str) -> Said:
+        return Said(run_rhmc("search", *words), *capfd.readouterr())
 
     return call
 
