@@ -22,7 +22,7 @@ from rhmc.types import Batch, Obs, Transition
 from tests import toy
 from tests.blocks import fields, fitted, flat, nested
 from tests.conformance import DifferentError, assert_same
-from tests.support import seeded, through_a_file
+from tests.support import reordered, seeded, through_a_file
 
 EPISODE = 7  # of both tasks here, so that runs of a few steps cross its end
 SMALL = {
@@ -418,10 +418,6 @@ def test_greedy_acting_is_not_random_and_exploring_is_decided_by_the_generator(c
         assert drawn.unique().tolist() == list(range(env.spec.actions))
 
 
-def reorder(obs: Obs, order: list[int]) -> Obs:
-    return Obs(obs.agents[:, order], obs.pairs[:, order], obs.peers[:, order][:, :, order], obs.first)
-
-
 EXTENDED: list[Any] = [
     coverage.Config(agents=4, targets=5, observation="extended"),
     navigation.Config(agents=4, observation="extended", episode=EPISODE),
@@ -440,7 +436,7 @@ def test_reordering_agents_reorders_what_they_do(kind: str, cfg: Any) -> None:
         _shift(state, 1.0)
         algo.load_state_dict(state)
         (action, _, extra), (moved, _, told) = (
-            algo.act(x, algo.carry(30), seeded(), explore=False) for x in (obs, reorder(obs, order))
+            algo.act(x, algo.carry(30), seeded(), explore=False) for x in (obs, reordered(obs, order))
         )
         done = [(action, moved)] + [(extra[key], told[key]) for key in extra.keys() & {"assignment"}]
         assert all(torch.equal(after, before[:, order]) for before, after in done)

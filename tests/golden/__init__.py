@@ -16,13 +16,13 @@ from torch import Tensor
 from pipelines.export.tables import write_tables
 from pipelines.specs.study import Setting
 from pipelines.tracking.plan import items, study_card
-from pipelines.tracking.tracker import MemoryTracker
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import ENVS
 from rhmc.learning.learner import Learner
 from rhmc.training.trainer import Trainer
 from rhmc.yardsticks.scores import play_yardsticks
 from tests.blocks import fitted, flat, nested
+from tests.memory_tracker import MemoryTracker
 from tests.pipelines.support import tiny
 
 FILE = Path(__file__).with_name("digests.json")

@@ -1,17 +1,19 @@
 """A tiny study, also as a program: `python -m tests.pipelines.support HOME POINTS CONCURRENT` launches it."""
 
 import os
+import shutil
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import psutil
 import pytest
 
+from pipelines.cli import main as cli
 from pipelines.specs.identity import code_id
 from pipelines.specs.study import Resources, RunSpec, Setting, Study
 from pipelines.tracking.plan import Item, items
@@ -77,6 +79,30 @@ def tiny(
 def plan(study: Study | None = None) -> list[Item]:
     """Its runs."""
     return items(study or tiny(), "abc-dirty")
+
+
+class Said(NamedTuple):
+    """The exit code and the output of a command."""
+
+    code: int
+    out: str
+    err: str
+
+
+def run_rhmc(*words: str) -> int:
+    """The exit code of the command `rhmc`, in this process."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["rhmc", *words])
+        with pytest.raises(SystemExit) as caught:
+            cli.main()
+    return int(caught.value.code or 0)
+
+
+def fresh(folder: Path, template: Path) -> Path:
+    """A work folder with an empty MLflow database."""
+    folder.mkdir(exist_ok=True)
+    shutil.copy(template, folder / "mlflow.db")
+    return folder
 
 
 def jobs_of(module: str, monkeypatch: pytest.MonkeyPatch) -> list[int]:

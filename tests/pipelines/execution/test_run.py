@@ -33,10 +33,11 @@ from pipelines.export.tables import export_study
 from pipelines.specs.study import Study
 from pipelines.tracking.mlflow_tracker import MlflowTracker, open_existing
 from pipelines.tracking.plan import Item, commit, items, study_card, what_varies
-from pipelines.tracking.tracker import MemoryRun, MemoryTracker, StudyCard, points_of
+from pipelines.tracking.tracker import StudyCard, points_of
 from pipelines.workspace.work_folder import Checkpoints, Home, StoreError
 from rhmc.algorithms import iql
 from rhmc.training.trainer import Trainer
+from tests.memory_tracker import MemoryRun, MemoryTracker
 from tests.pipelines.support import CODE, plan, setting, spec, tiny
 from tests.robustness.chaos import fit_here
 

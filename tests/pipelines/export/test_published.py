@@ -15,10 +15,10 @@ from pipelines.export.published import Again, folder, publish, retrain
 from pipelines.export.tables import VERSION, write_tables
 from pipelines.specs.study import Study
 from pipelines.tracking.plan import items, study_card
-from pipelines.tracking.tracker import MemoryTracker
 from pipelines.workspace.errors import InputError
 from reports.analyses.equivalence import read
 from rhmc.training.trainer import Trainer
+from tests.memory_tracker import MemoryTracker
 from tests.pipelines.support import setting, tiny
 
 STUDY = tiny(arms={"slow": setting(lr=1e-4), "fast": setting(lr=1e-2)}).model_copy(update={"seeds": 2})
@@ -95,7 +95,7 @@ def test_what_is_published_by_the_command_is_equal_to_what_it_is_of(exported: Pa
     moved = verify("--runs", edited(exported, tmp_path / "a", 3.0, "fast"))
     assert (moved.code, moved.text.splitlines()[-1]) == (
         1,
-        "against the published quick results: 1 arms not shown to be equivalent, 1 arms byte-equal",
+        "against the published quick results: 1 arm not shown to be equivalent, 1 arm byte-equal",
     )
 
 
@@ -104,8 +104,8 @@ def test_shifted_arms(exported: Path, tmp_path: Path) -> None:
     said = verify("--runs", edited(exported, tmp_path / "a", 3.0, "fast"))
     assert said.code == 1
     assert "+3.00" in said.text
-    assert "1 arms not shown to be equivalent" in said.text
-    assert "1 arms byte-equal" in said.text
+    assert "1 arm not shown to be equivalent" in said.text
+    assert "1 arm byte-equal" in said.text
     wide = verify("--runs", tmp_path / "a", "--margin", "1e6")
     assert (wide.code, "equivalent" in wide.text) == (0, True)
 

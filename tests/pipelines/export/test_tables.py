@@ -10,10 +10,10 @@ import torch
 from pipelines.export.tables import MADE, METRICS, RUNS, export_study, write_tables
 from pipelines.specs.study import RunSpec
 from pipelines.tracking.plan import Item, items, study_card
-from pipelines.tracking.tracker import MemoryRun, MemoryTracker
 from pipelines.workspace.provenance import Host, host
 from pipelines.workspace.work_folder import StoreError
 from reports.data.exported import FORMS
+from tests.memory_tracker import MemoryRun, MemoryTracker
 from tests.pipelines.support import CODE, plan, tiny
 
 POINTS = [

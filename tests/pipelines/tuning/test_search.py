@@ -23,7 +23,6 @@ from optuna.storages import InMemoryStorage
 from rich.console import Console
 from ruamel.yaml import YAML
 
-from pipelines.cli import main as cli
 from pipelines.execution import ray_driver
 from pipelines.execution.finite import DivergedError
 from pipelines.execution.progress import PlainBoard
@@ -32,7 +31,7 @@ from pipelines.execution.trainable import ending
 from pipelines.specs.search import EVAL_SEED, FIRST_SEED, Dimension, Search
 from pipelines.specs.study import Setting, Study, StudyError
 from pipelines.tracking.mlflow_tracker import open_existing
-from pipelines.tracking.tracker import MemoryRun, MemoryTracker, points_of
+from pipelines.tracking.tracker import points_of
 from pipelines.tuning import ray_workers
 from pipelines.tuning.best_params import file_name, winner_yaml
 from pipelines.tuning.ray_workers import Failed
@@ -41,8 +40,9 @@ from pipelines.tuning.search_run import Drive, TrialLog, results, run_search, se
 from pipelines.tuning.trials import ArmStudy, look, open_storage
 from pipelines.workspace.work_folder import Home, StoreError
 from rhmc.training.trainer import Trainer
+from tests.memory_tracker import MemoryRun, MemoryTracker
 from tests.pipelines.execution.test_trainable import same
-from tests.pipelines.support import CODE, interrupt, setting
+from tests.pipelines.support import CODE, Said, interrupt, run_rhmc, setting
 from tests.robustness.killed import PoolHere
 from tests.support import changing
 
@@ -828,7 +828,7 @@ def test_trials_of_other_code_are_stale(tmp_path: Path) -> None:
 
 # The command
 
-Rhmc = Callable[..., tuple[int, str, str]]
+Rhmc = Callable[..., Said]
 
 
 @pytest.fixture
@@ -837,12 +837,8 @@ def rhmc(project: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFi
     load()
     monkeypatch.setenv("RHMC_HOME", str(project / "work"))
 
-    def call(*words: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["rhmc", "search", *words])
-        with pytest.raises(SystemExit) as caught:
-            cli.main()
-        out, err = capfd.readouterr()
-        return int(caught.value.code or 0), out, err
+    def call(*words: str) -> Said:
+        return Said(run_rhmc("search", *words), *capfd.readouterr())
 
     return call
 

@@ -33,7 +33,7 @@ def test_equal_results_are_byte_equal_whatever_their_order_and_whatever_else_is_
     here = tables(a=SEEDS, b=SEEDS, c=SEEDS).sample(frac=1, random_state=0)
     (one,) = compare(here, published)
     assert (one.outcome, one.holds, one.seeds, one.note) == ("byte-equal", True, 5, "")
-    assert summary([one], "quick") == "byte-equal to the published quick results: 1 arms"
+    assert summary([one], "quick") == "byte-equal to the published quick results: 1 arm"
 
 
 @pytest.mark.parametrize(
@@ -53,7 +53,7 @@ def test_a_shifted_arm(shift: float, expected: str, holds: bool) -> None:
     assert first.note.startswith("first difference: seed 0, step ")
     assert second.outcome == "byte-equal"
     assert [row[:3] for row in table([first, second])] == [["main", "a", "5"]]
-    assert f"1 arms {expected}" in summary([first, second], "quick")
+    assert f"1 arm {expected}" in summary([first, second], "quick")
 
 
 def test_the_last_bit_of_one_value_counts() -> None:
