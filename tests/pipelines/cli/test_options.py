@@ -110,8 +110,8 @@ CASES = [
     ),
     Case(
         "report --profile paper --study studies/x.yaml --variant large --runs r --out o",
-        {"reports.pages.build.main": 0},
-        ("main([--profile, paper, --study, x@large, --runs, r, --out, o], visible_lines)",),
+        {"reports.pages.build.write_report": 0},
+        ("write_report(r, o, paper, x@large, visible_lines)",),
     ),
     Case("methods --out o", {"pipelines.export.methods.export_methods": ""}, ("export_methods(o)",)),
     Case("drawings --out o", {"pipelines.export.drawings.export_drawings": []}, ("export_drawings(o)",)),
