@@ -93,11 +93,20 @@ def test_a_run_whose_adopted_copy_is_in_the_log_is_not_stale() -> None:
         copy = tracker.start(item.card)
         copy.tag(ADOPTED, f"{FROM}0ldc0de00000: seed 0 trained again")
         copy.finish("finished")
-    (line,) = reasons(items(STUDY), tracker.recorded(), tracker)
-    assert line == "stale: arm 'fast', 1 run: other settings: algo.gamma was 0.5, now 0.99"
-    tracker.shelf.pop()
-    lines = reasons(items(STUDY), tracker.recorded(), tracker)
-    assert [line.partition(":")[2].partition(":")[0] for line in lines] == [" arm 'fast', 1 run"] * 2
+    kept = "stale: arm 'fast', 1 run: other settings: algo.gamma was 0.5, now 0.99"
+    assert reasons(items(STUDY), tracker.recorded(), tracker) == [kept]
+    unlisted = "which kept no list of its modules"
+    other = slow.card._replace(fingerprint="0ther0000000", modules={})  # code of which nothing was adopted
+    tracker.start(other).finish("finished")
+    assert reasons(items(STUDY), tracker.recorded(), tracker) == [
+        kept,
+        f"stale: arm 'slow', 1 run: made by other code (0ther0000000), {unlisted}",
+    ]
+    (copy_of_fast,) = (run for run in tracker.shelf if run.card.key == fast.key)
+    tracker.drop(copy_of_fast.ref)
+    assert f"stale: arm 'fast', 1 run: made by other code (0ldc0de00000), {unlisted}" in reasons(
+        items(STUDY), tracker.recorded(), tracker
+    )
 
 
 def test_mlflow_keeps_the_list(home: Path) -> None:
