@@ -12,6 +12,8 @@ from torch import Generator, Tensor
 from torch.nn import functional
 from torch.overrides import TorchFunctionMode
 
+from pipelines.specs.document import settings
+from pipelines.tracking.plan import flatten
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import ENVS, Task, coverage, make_env, navigation
 from rhmc.envs.base import Env
@@ -20,7 +22,7 @@ from rhmc.networks.nets import Unshared
 from rhmc.training.trainer import Config, Trainer
 from rhmc.types import Batch, Obs, Transition
 from tests import toy
-from tests.blocks import fields, fitted, flat, nested
+from tests.blocks import fitted, nested
 from tests.conformance import DifferentError, assert_same
 from tests.support import reordered, seeded, through_a_file
 
@@ -98,7 +100,7 @@ UNSHARED = {f"{kind} unshared": Case(settle(kind, share=False), TASKS["navigatio
 SCALE = {  # RHMC has one for each level, in variants of its own
     kind: name
     for kind, name in product(ALGORITHMS, ("standardise", "coordinator.standardise"))
-    if kind != "rhmc" and name in fields(ALGORITHMS[kind].config)
+    if kind != "rhmc" and name in settings(ALGORITHMS[kind].config)
 }
 SCALED = {
     f"{kind} {scale}": Case(settle(kind, **{name: scale}), TASKS["navigation"])
@@ -507,7 +509,7 @@ class Targets(TorchFunctionMode):
 def plain(algo: Any, **changes: Any) -> Any:
     """A method's settings with those of `PLAIN` and `changes` that it has."""
     config = type(algo)
-    return config(**nested(flat(algo.model_dump()) | fitted(config, PLAIN | changes)))
+    return config(**nested(flatten(algo.model_dump()) | fitted(config, PLAIN | changes)))
 
 
 def transition(env: Env, obs: Obs, algo: Any, **changes: Any) -> Transition:
@@ -614,7 +616,7 @@ def test_a_terminal_row_is_worth_its_reward(case: Case) -> None:
 ON_POLICY = {
     name: case
     for name, case in ONE_STEP.items()
-    if {"n_steps", "coordinator.n_steps"} & set(fields(type(case.algo))) and getattr(case.algo, "pretrain", 0) == 0
+    if {"n_steps", "coordinator.n_steps"} & set(settings(type(case.algo))) and getattr(case.algo, "pretrain", 0) == 0
 }
 
 
