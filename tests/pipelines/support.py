@@ -127,6 +127,15 @@ def started_by(driver: int, name: str = "") -> list[psutil.Process]:
     return found
 
 
+def all_end(driver: int, name: str = "") -> bool:
+    """True if nothing that a driver started, with `name` in its command line, is left within a minute."""
+    for _ in range(600):
+        if not started_by(driver, name):
+            return True
+        time.sleep(0.1)
+    return False
+
+
 def interrupt(home: Path) -> None:
     """Send this process Ctrl-C, once a launch of it listens and has trained on."""
     before = set(home.glob("checkpoints/*/0*.pt"))

@@ -42,7 +42,7 @@ from pipelines.workspace.work_folder import Home, StoreError
 from rhmc.training.trainer import Trainer
 from tests.memory_tracker import MemoryRun, MemoryTracker
 from tests.pipelines.execution.test_trainable import same
-from tests.pipelines.support import CODE, Said, interrupt, run_rhmc, setting
+from tests.pipelines.support import CODE, Said, all_end, interrupt, run_rhmc, setting
 from tests.robustness.killed import PoolHere
 from tests.support import changing
 
@@ -896,6 +896,7 @@ def test_a_killed_and_interrupted_search_ends_as_one_that_was_not(
     wait_for(work, lambda: bool(list(work.glob("checkpoints/*/0*.pt"))), process)
     process.kill()
     process.wait()
+    assert all_end(process.pid, "ray::")  # else one still saves a point, which `interrupt` takes for the launch below
     assert show_search(search, work) == 1
     threading.Thread(target=interrupt, args=(work,)).start()
     assert run_search(search, work, work / "out") == 130
