@@ -38,16 +38,15 @@ setup: $(READY) ## The environment in .venv, exactly as in requirements.lock
 # The page is no out of the pipeline (dvc.yaml says why): it is made where it is missing, or older than what it is of.
 # Results that differ from the published ones are said in the last line and are no failure: the run is done.
 repro: $(READY) ## Train, track and report on the profile in params.yaml; an interrupted one continues
-	@rhmc profile > /dev/null
-	@dvc repro || { echo "Not finished. What is done is kept: \`make repro\` continues."; exit 1; }
 	@profile=$$(rhmc profile); out="results/$$profile"; \
+	  dvc repro || { echo "Not finished. What is done is kept: \`make repro\` continues."; exit 1; }; \
 	  [[ -e "$$out/index.html" && -z "$$(find "$$out/runs" -newer "$$out/index.html")" ]] || \
-	  rhmc report --profile "$$profile"
-	@echo
-	@echo "Report:    results/$$(rhmc profile)/index.html"
-	@echo "MLflow UI: run \`make ui\` and open the address that it prints"
-	@profile=$$(rhmc profile); test ! -d "results/published/$$profile" || \
-	  rhmc verify --runs "results/$$profile/runs" --profile "$$profile" || test $$? -eq 1
+	    rhmc report --profile "$$profile"; \
+	  echo; \
+	  echo "Report:    $$out/index.html"; \
+	  echo "MLflow UI: run \`make ui\` and open the address that it prints"; \
+	  test ! -d "results/published/$$profile" || \
+	    rhmc verify --runs "$$out/runs" --profile "$$profile" || test $$? -eq 1
 
 test: check ## Lint, types and every test
 	@python -m pytest -n $(JOBS) $(SHARED)

@@ -39,14 +39,14 @@ def keep_memory() -> None:
 
 
 def possible() -> bool:
-    """Whether this processor has the instructions; results of another kind are its own."""
+    """True if this processor has the instructions; results of another kind are its own."""
     if not X86:
         return False
     return not CPUINFO.exists() or {"avx2", "fma"} <= set(CPUINFO.read_text(encoding="utf-8").split())
 
 
 def active() -> bool:
-    """Whether torch follows the settings; not if it computed something before they were made."""
+    """True if torch follows the settings; not if it computed something before they were made."""
     import torch
 
     return not possible() or torch.backends.cpu.get_cpu_capability() == CAPABILITY

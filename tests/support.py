@@ -23,6 +23,11 @@ def observation(spec: Spec, batch: int = 1, *, first: bool = False) -> Obs:
     return Obs(agents, pairs, torch.randn(batch, n, n, spec.peer_features), torch.full((batch,), first))
 
 
+def reordered(obs: Obs, order: list[int]) -> Obs:
+    """The same observation with its agents in another order."""
+    return Obs(obs.agents[:, order], obs.pairs[:, order], obs.peers[:, order][:, :, order], obs.first)
+
+
 def observed(spec: Spec, batch: int) -> Batch:
     """Columns of random observations and of those after them, as replay holds them."""
     return pack(observation(spec, batch)) | pack(observation(spec, batch), "next_")

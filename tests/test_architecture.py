@@ -543,15 +543,8 @@ def is_search(path: Path) -> bool:
     return path.stem.startswith("search_")
 
 
-NO_PAGE = {"reports/analyses/equivalence.py", "reports/analyses/readings.py"}  # what no page is made with
-
-
 def test_the_report_depends_on_all_its_modules(stages: dict) -> None:
-    places = [ROOT / "reports", *(ROOT / "reports" / room for room in ROOMS["reports"])]
-    found = [p for place in places for p in place.glob("*") if p.suffix in {".py", ".yaml", ".j2"}]
-    parts = {p.relative_to(ROOT).as_posix() for p in found if p.name != "__init__.py"}
-    listed = {d for d in stages["report"]["deps"] if "${" not in d}
-    assert unmatched("dvc.yaml", parts - NO_PAGE, listed) == []
+    assert "reports" in stages["report"]["deps"]
 
 
 def test_every_stage_that_computes_waits_for_the_fingerprint(stages: dict) -> None:

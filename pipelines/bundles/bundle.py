@@ -36,7 +36,6 @@ from pipelines.workspace.work_folder import Checkpoints, Home, StoreError, whole
 
 ARCHIVE = ".zip"
 DESK = "import"
-LINE = 400  # characters of a fault
 
 
 class Packed(NamedTuple):
@@ -206,13 +205,7 @@ def unpack(bundle: Path, home: Path) -> Taken:
                 with place.lock(card.study, card.profile):
                     return _take_in(told, card, place, Stock(files, seals, desk))
     except BundleError as error:
-        raise StoreError(f"{bundle}: {_plain(str(error))}") from error
-
-
-def _plain(text: str) -> str:
-    """A fault as a line: what a bundle or a library brings into it is escaped and cut."""
-    line = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
-    return line if len(line) <= LINE else f"{line[:LINE]}…"
+        raise StoreError(f"{bundle}: {error}") from error
 
 
 class Stock(NamedTuple):

@@ -16,7 +16,7 @@ from pydantic import AfterValidator, Field, Json, StringConstraints, TypeAdapter
 
 from pipelines.bundles import files as bundle_files
 from pipelines.bundles.files import KEY, MANIFEST, BundleError, Files
-from pipelines.specs.document import SHOWN, choices, nearest, show
+from pipelines.specs.document import choices, nearest, show
 from pipelines.specs.study import FIELDS, PROFILES, RunSpec, arm_fault, study_fault
 from pipelines.tracking.plan import KIND, Item, flatten
 from pipelines.tracking.policy import NO_SPEC
@@ -211,14 +211,6 @@ def _manifest(files: Files) -> Manifest:
         raise BundleError(f"{MANIFEST}: {_first(error)}") from error
 
 
-def shown(value: Any) -> str:
-    """Any value of a bundle as a person may see it."""
-    if value is None or isinstance(value, str | int | float):
-        return show(value)
-    text = json.dumps(value, default=lambda inner: type(inner).__name__) if isinstance(value, dict | list) else ""
-    return text[:SHOWN] or f"a {type(value).__name__}"
-
-
 def _first(error: ValidationError) -> str:
     """The first fault: where, what, and what is allowed."""
     detail = error.errors(include_url=False)[0]
@@ -230,7 +222,7 @@ def _first(error: ValidationError) -> str:
     rule = rule[:1].lower() + rule[1:]
     if detail["type"] in ("missing", "extra_forbidden") or not detail["loc"]:
         return place + rule
-    return f"{place}{shown(detail['input'])} is not allowed; {rule}"
+    return f"{place}{show(detail['input'])} is not allowed; {rule}"
 
 
 def _table(files: Files, name: str, schema: pa.Schema) -> pa.Table:
@@ -374,7 +366,7 @@ def _spec(where: str, config: str) -> RunSpec:
     except NO_SPEC as error:
         raise BundleError(f"{where}: config: no settings that this code knows ({one_line(error)})") from error
     if not isinstance(spec.algo, Frozen):  # nothing but a mapping is made a configuration of its kind
-        raise BundleError(f"{where}: config: algo: {shown(spec.algo)} is not allowed; must be a mapping")
+        raise BundleError(f"{where}: config: algo: {show(spec.algo)} is not allowed; must be a mapping")
     numbers = {name: value for name, value in flatten(spec.model_dump()).items() if isinstance(value, float)}
     if astray := [name for name, value in numbers.items() if not math.isfinite(value)]:
         raise BundleError(f"{where}: config: {astray[0]}: {numbers[astray[0]]} is not allowed; must be a finite number")

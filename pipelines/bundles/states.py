@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from pipelines.bundles.files import BundleError, Files
-from pipelines.bundles.rows import Entry, metric_fault, on_grid, shown
+from pipelines.bundles.rows import Entry, metric_fault, on_grid
 from pipelines.execution.finite import astray
 from pipelines.specs.document import show
 from pipelines.tracking.plan import resolved_yaml
@@ -127,7 +127,7 @@ def _check_progress(name: str, point: str, state: dict[str, Any], entry: Entry) 
     if not told or not 0 < done == len(history) <= cfg.evaluations + 1:
         raise BundleError(f"{name}: has not the {done} points of its name")
     if not _real(trainer["step"]) or trainer["step"] != grid_step(cfg, done - 1):
-        raise BundleError(f"{name}: step {shown(trainer['step'])} is not allowed; must be {grid_step(cfg, done - 1):,}")
+        raise BundleError(f"{name}: step {show(trainer['step'])} is not allowed; must be {grid_step(cfg, done - 1):,}")
     for values in history:
         if fault := _history_fault(values, entry):
             raise BundleError(f"{name}: history: {fault}")
@@ -141,7 +141,7 @@ def _history_fault(values: Any, entry: Entry) -> str:
         return f"step {step} is not allowed; must be on the run's grid"
     for metric, value in values.items():
         if not isinstance(metric, str) or not _real(value):
-            return f"{shown(metric)} at step {step:.0f} must be a finite number"
+            return f"{show(metric)} at step {step:.0f} must be a finite number"
         if metric != "step" and (fault := metric_fault(metric)):
             return f"{show(metric)} is not allowed; {fault}"
     return ""

@@ -112,10 +112,7 @@ def report(
         raise InputError(f"--study: {study}: {fault}")
     if variant is not None and not simple(variant):
         raise InputError(f"--variant: {variant!r} is not allowed; letters, digits, '-' and '_' only")
-    from reports.pages.build import main as build
+    from reports.pages.build import write_report
 
-    arguments = ["--profile", profile]
-    arguments += ["--study", study_name(study, variant or "")] if study else []
-    arguments += ["--runs", str(runs)] if runs else []
-    arguments += ["--out", str(out)] if out else []
-    raise typer.Exit(build(arguments, visible_lines))
+    name = study_name(study, variant or "") if study else None
+    raise typer.Exit(write_report(runs, out, profile, name, visible_lines))

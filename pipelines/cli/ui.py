@@ -78,7 +78,7 @@ def _serve(uri: str, artifacts: Path, port: int, saved: Iterable[tuple[str, str,
         "PYTHONSAFEPATH": "1",  # no module of the work folder is taken for one of Python's
     }
 
-    def leave(number: int, frame: FrameType | None) -> None:
+    def leave(_number: int, _frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
     signal.signal(signal.SIGTERM, leave)

@@ -1,7 +1,5 @@
 """`rhmc yardsticks`: scores of policies that need no learning."""
 
-import inspect
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,42 +15,56 @@ if TYPE_CHECKING:
 app = typer.Typer(help="Score the yardsticks: policies without learning, and bounds.", no_args_is_help=True)
 
 Fields = dict[str, Any]
+Episodes = Annotated[int, typer.Option(min=2, max=EPISODES, help="Episodes of the evaluation.")]
+Policies = Annotated[str | None, typer.Option(help="Names with commas between; all but the planner if not given.")]
+Seed = Annotated[int, typer.Option(min=0, max=SEED, help="Seed of the episodes.")]
+Out = Annotated[Path | None, typer.Option(help="Also write yardsticks.parquet there, beside the runs' tables.")]
+OutProfile = Annotated[str, typer.Option(help="The profile that --out is for.")]
 
 
-def verb(name: str) -> Callable[[Callable[..., Fields]], Callable[..., None]]:
-    """Make a verb of a function from a task's options to its fields: the options that all tasks share are added."""
+@app.command()
+def coverage(
+    preset: Annotated[str, typer.Option(help="flat, executor or coordinator.")] = "flat",
+    agents: Annotated[int, typer.Option(help="Sensors.")] = 4,
+    targets: Annotated[int, typer.Option(help="Targets.")] = 5,
+    episodes: Episodes = 1000,
+    policies: Policies = None,
+    seed: Seed = 0,
+    as_json: Json = False,
+    out: Out = None,
+    profile: OutProfile = "quick",
+) -> None:
+    """Coverage: the share of targets in view, its standard error and the mean reward, in percent."""
+    fields = {"preset": preset, "agents": agents, "targets": targets}
+    _score("coverage", fields, episodes, policies, seed, as_json, out, profile)
 
-    def of_task(fields: Callable[..., Fields]) -> Callable[..., None]:
-        own = inspect.signature(fields).parameters
-        shared = inspect.signature(_score).parameters
 
-        def call(**given: Any) -> None:
-            task = fields(**{option: given.pop(option) for option in own})
-            _score(name, task, **given)
-
-        options = [*own.values(), *(p for option, p in shared.items() if option not in ("kind", "fields"))]
-        call.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
-        call.__annotations__ = {option.name: option.annotation for option in options}
-        call.__doc__ = fields.__doc__
-        app.command(name)(call)
-        return call
-
-    return of_task
+@app.command()
+def navigation(
+    agents: Annotated[int, typer.Option(help="Agents, and as many landmarks.")] = 3,
+    reward: Annotated[str, typer.Option(help="paper, mpe2 or mpe1.")] = "paper",
+    order: Annotated[str, typer.Option(help="Order of integration: mpe2 or mpe1.")] = "mpe2",
+    episodes: Episodes = 1000,
+    policies: Policies = None,
+    seed: Seed = 0,
+    as_json: Json = False,
+    out: Out = None,
+    profile: OutProfile = "quick",
+) -> None:
+    """Navigation: the return and its standard error, landmarks covered at the end, collisions."""
+    fields = {"agents": agents, "reward": reward, "order": order}
+    _score("navigation", fields, episodes, policies, seed, as_json, out, profile)
 
 
 def _score(
     kind: str,
     fields: Fields,
-    episodes: Annotated[int, typer.Option(min=2, max=EPISODES, help="Episodes of the evaluation.")] = 1000,
-    policies: Annotated[
-        str | None, typer.Option(help="Names with commas between; all but the planner if not given.")
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, max=SEED, help="Seed of the episodes.")] = 0,
-    as_json: Json = False,
-    out: Annotated[
-        Path | None, typer.Option(help="Also write yardsticks.parquet there, beside the runs' tables.")
-    ] = None,
-    profile: Annotated[str, typer.Option(help="The profile that --out is for.")] = "quick",
+    episodes: int,
+    policies: str | None,
+    seed: int,
+    as_json: bool,
+    out: Path | None,
+    profile: str,
 ) -> None:
     import torch
 
@@ -100,26 +112,6 @@ def _env(kind: str, fields: Fields) -> Any:
     if cfg is None:
         raise InputError(*map(str, faults))
     return cfg
-
-
-@verb("coverage")
-def coverage(
-    preset: Annotated[str, typer.Option(help="flat, executor or coordinator.")] = "flat",
-    agents: Annotated[int, typer.Option(help="Sensors.")] = 4,
-    targets: Annotated[int, typer.Option(help="Targets.")] = 5,
-) -> Fields:
-    """Coverage: the share of targets in view, its standard error and the mean reward, in percent."""
-    return {"preset": preset, "agents": agents, "targets": targets}
-
-
-@verb("navigation")
-def navigation(
-    agents: Annotated[int, typer.Option(help="Agents, and as many landmarks.")] = 3,
-    reward: Annotated[str, typer.Option(help="paper, mpe2 or mpe1.")] = "paper",
-    order: Annotated[str, typer.Option(help="Order of integration: mpe2 or mpe1.")] = "mpe2",
-) -> Fields:
-    """Navigation: the return and its standard error, landmarks covered at the end, collisions."""
-    return {"agents": agents, "reward": reward, "order": order}
 
 
 @app.command("all")

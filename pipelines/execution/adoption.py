@@ -15,7 +15,7 @@ from pipelines.execution.recorder import copy_run
 from pipelines.specs.study import Study
 from pipelines.tracking.plan import Item, finished, items, study_card
 from pipelines.tracking.staleness import kept_settings
-from pipelines.tracking.tracker import ADOPTED, Recorded, Row, StudyCard, Tracker, points_of
+from pipelines.tracking.tracker import ADOPTED, FROM, Recorded, Row, StudyCard, Tracker, points_of
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.process_pool import side_by_side
 from pipelines.workspace.work_folder import Home
@@ -32,11 +32,6 @@ class Older(NamedTuple):
 
     item: Item
     run: Recorded
-
-    @property
-    def code(self) -> str:
-        """The code that made it."""
-        return self.run.key.rpartition("-")[2]
 
 
 class Difference(NamedTuple):
@@ -114,9 +109,9 @@ def _settle(
     for one in runs:
         points = points_of(tracker.rows([one.run.ref]))
         card = one.item.card._replace(commit=one.run.commit, host=one.run.host)  # of what computed it
-        tags = {ADOPTED: f"from code {one.code}: {proof}"}
+        tags = {ADOPTED: f"{FROM}{one.run.code}: {proof}"}
         copy_run(tracker, study, one.run.ref, one.item._replace(card=card), points, tags, say)
-    say(f"adopted: {len(runs)} runs of arm '{proof.arm}': {proof}")
+    say(f"adopted: {len(runs)} run{'s' * (len(runs) > 1)} of arm '{proof.arm}': {proof}")
 
 
 def _left(plan: Iterable[Item], tracker: Tracker) -> bool:
@@ -136,7 +131,7 @@ def older(plan: Iterable[Item], tracker: Tracker) -> dict[str, list[Older]]:
     found: dict[tuple[str, str], Older] = {}
     for run in recorded:
         if run.status == "finished" and run.arm in arms:
-            item = wanted.get((run.arm, run.key.partition("-")[0])) or wanted.get((run.arm, _settings_id(run, tracker)))
+            item = wanted.get((run.arm, run.spec_id)) or wanted.get((run.arm, _settings_id(run, tracker)))
             if item and run.key != item.key:
                 found[run.arm, item.card.spec_id] = Older(item, run)
     by_arm: dict[str, list[Older]] = {}

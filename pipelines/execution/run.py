@@ -21,7 +21,7 @@ from pipelines.specs.limits import absent
 from pipelines.specs.source_file import another, remember
 from pipelines.specs.study import Study
 from pipelines.tracking.plan import Item, finished, given_twice, items, read_commit, study_card
-from pipelines.tracking.staleness import reasons
+from pipelines.tracking.staleness import stale_lines, stale_runs
 from pipelines.tracking.tracker import Tracker
 from pipelines.workspace.addresses import without_password
 from pipelines.workspace.errors import InputError, visible
@@ -363,12 +363,14 @@ def _status(study: Study, home: Home) -> Standing:
     seen = {"running": "interrupted"} if own and not home.driven(study.name, study.profile) else {}
     state = {(run.arm, run.key): seen.get(run.status, run.status) for run in recorded}
     planned = {(item.card.arm, item.key) for item in plan}
-    stale = Counter(run.arm for run in recorded if (run.arm, run.key) not in planned)
+    others = stale_runs(plan, recorded, tracker) if tracker else []
+    of_arm = Counter(arm for arm, _ in others)
     arms = {}
     for arm, places in _by_arm(plan).items():
         mine = Counter(state.get(place, "missing") for place in places)
-        arms[arm] = {"planned": len(places)} | {kind: mine[kind] for kind in STATES} | {"stale": stale[arm]}
+        arms[arm] = {"planned": len(places)} | {kind: mine[kind] for kind in STATES} | {"stale": of_arm[arm]}
     failed = {(run.arm, run.key): run.error for run in recorded if run.status == "failed"}
     errors = {item.name: failed[item.card.arm, item.key] for item in plan if (item.card.arm, item.key) in failed}
-    why = reasons(plan, recorded, tracker) if tracker else []
-    return Standing(planned <= finished(recorded), arms, errors, why, tracker.remarks if tracker else [])
+    return Standing(
+        planned <= finished(recorded), arms, errors, stale_lines(others), tracker.remarks if tracker else []
+    )

@@ -253,13 +253,15 @@ def join(path: str, name: str) -> str:
     return f"{path}.{name}" if path else name
 
 
-def plain(node: Node) -> Any:
-    """The value without places."""
-    if isinstance(node.value, dict):
-        return {key: plain(child) for key, child in node.value.items()}
-    if isinstance(node.value, list):
-        return [plain(child) for child in node.value]
-    return None if isinstance(node.value, Unreadable) else node.value
+def plain(value: Any) -> Any:
+    """A node or a value without places."""
+    if isinstance(value, Node):
+        return plain(value.value)
+    if isinstance(value, dict):
+        return {key: plain(child) for key, child in value.items()}
+    if isinstance(value, list):
+        return [plain(child) for child in value]
+    return None if isinstance(value, Unreadable) else value
 
 
 def merge(base: Node, patch: Node) -> Node:
@@ -408,13 +410,13 @@ def _inner(annotation: Any) -> type[BaseModel] | None:
 
 
 def show(value: Any) -> str:
-    """A value as a person would write it in YAML, cut to `SHOWN` characters."""
+    """A value as a person would write it in YAML, or else its type; cut to `SHOWN` characters."""
     if isinstance(value, str):
         text = f"'{value}'" if value.isprintable() else repr(value)
-    elif isinstance(value, dict | list):
-        text = json.dumps(plain(Node(value, Place(""), Place(""), "")), ensure_ascii=False)
+    elif value is None or isinstance(value, int | float | dict | list):
+        text = json.dumps(plain(value), ensure_ascii=False, skipkeys=True, default=lambda inner: type(inner).__name__)
     else:
-        text = json.dumps(value)
+        text = f"a {type(value).__name__}"
     return text if len(text) <= SHOWN else text[: SHOWN - 1] + "…"
 
 

@@ -60,12 +60,12 @@ class _Way(NamedTuple):
     files: tuple[Path, ...] = ()
 
     def file(self, name: str) -> Path:
-        """What a name stands for here; where there is no such file, the first place that it was looked for."""
+        """The file that a name stands for here, or, if there is none, the first place that was searched."""
         found = [folder / (name if name.endswith(SUFFIX) else name + SUFFIX) for folder in self.folders()]
         return next((path for path in found if fault_of(path) != ABSENT), found[0])
 
     def folders(self) -> list[Path]:
-        """Where names start, in this order."""
+        """The folders in which names start, in this order."""
         return list(dict.fromkeys([*(file.parent for file in self.files[-1:]), self.study, PROJECT, SHIPPED]))
 
 
@@ -144,7 +144,7 @@ def _named(link: Node, way: _Way) -> tuple[Path | None, list[Fault]]:
 
 
 def _offered(way: _Way, name: str) -> list[str]:
-    """What there is to include, spelled as the name is: with `.yaml` or without."""
+    """The files that can be included, spelled as the name is: with `.yaml` or without."""
     files = [p.relative_to(folder) for folder in way.folders() for at in DEPTHS for p in sorted(folder.glob(at))]
     return [(file if name.endswith(SUFFIX) else file.with_suffix("")).as_posix() for file in files]
 

@@ -3,11 +3,8 @@ together. The configurations of the science package say what is right; this says
 """
 
 import re
-from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, Any, get_args
-
-if TYPE_CHECKING:  # help, which shows bounds, answers without it
-    from pydantic import BaseModel
+from collections.abc import Iterable
+from typing import Any
 
 MOST = 10**9  # of a number that has no bound of its own
 SEED = 10**12  # what is added to a seed must not leave 64 bits
@@ -63,13 +60,6 @@ def beyond(name: str, value: Any) -> str:
     if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) > most:
         return f"must be at most {most:,}" if value > 0 else f"must be at least {-most:,}"
     return ""
-
-
-def numeric(model: "type[BaseModel]") -> Iterator[str]:
-    """The fields of a model that take a number."""
-    for name, field in model.model_fields.items():
-        if {int, float} & ({field.annotation} | set(get_args(field.annotation))):
-            yield name
 
 
 def misfit(env: Any, algo: Any) -> str:

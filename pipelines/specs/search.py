@@ -18,7 +18,7 @@ that no method is searched harder than another. There is neither a grid nor a va
 import hashlib
 import itertools
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from functools import reduce
 from operator import getitem
 from pathlib import Path
@@ -165,8 +165,15 @@ class Arm(NamedTuple):
     def fixed(self) -> str:
         """The setting as `Setting.stated` has it, without what the space replaces: equal where all trials are."""
         stated = json.loads(self.setting.stated())
-        stated["algo"] = {name: value for name, value in stated["algo"].items() if name not in self.space}
+        stated["algo"] = _outside(self.space, stated["algo"])
         return json.dumps(stated, sort_keys=True, separators=(",", ":"))
+
+
+def _outside(space: Collection[str], block: dict[str, Any], before: str = "") -> dict[str, Any]:
+    """The settings of a block that are not in the space, and of its blocks those that have any left."""
+    inner = {name: _outside(space, one, f"{before}{name}.") for name, one in block.items() if isinstance(one, dict)}
+    kept = block | inner
+    return {name: one for name, one in kept.items() if before + name not in space and one != {}}
 
 
 class Search(Frozen):

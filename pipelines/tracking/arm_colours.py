@@ -1,8 +1,8 @@
 """Colours of arms in MLflow: it picks a group's by a hash of its name, so that four arms may come in three greens.
 
 A run's tag `legend` is therefore its arm's name with a few characters of no width behind it, chosen so that the hash
-falls on the colour that the arm should have. Hash and palette are those of the pinned MLflow's web interface; should
-either change, colours are arbitrary again, and nothing else is lost.
+falls on the colour that the arm should have. Hash and palette are those of the pinned MLflow's web interface; a test
+compares them. Should either change, colours are arbitrary again, and nothing else is lost.
 """
 
 from collections.abc import Iterator

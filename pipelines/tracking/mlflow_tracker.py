@@ -555,7 +555,7 @@ def census(home: Home) -> list[Counted] | None:
     with explained(reader.uri):
         titles = {e.experiment_id: e.name for e in reader.client.search_experiments(max_results=1000)}
     runs = reader._listed(list(titles))
-    return [Counted(titles[experiment], run.status, run.key.rpartition("-")[2]) for experiment, run in runs]
+    return [Counted(titles[experiment], run.status, run.code) for experiment, run in runs]
 
 
 def open_existing(study: StudyCard, home: Home) -> MlflowTracker | None:

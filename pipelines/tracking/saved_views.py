@@ -1,7 +1,8 @@
 """Saved views of MLflow's run page, written as code: what a study shows as it opens.
 
 MLflow keeps a view as a tag of its experiment and opens it by an address. The form of both is its web interface's own
-and documented nowhere: it belongs to the MLflow that is pinned, and a new pin needs a look at this module.
+and documented nowhere: a test looks for it in the interface of the MLflow that is installed, and fails after a new pin
+that has another.
 """
 
 import base64

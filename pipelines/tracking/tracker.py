@@ -1,4 +1,4 @@
-"""The log of runs: the protocol, and a twin in memory that obeys it.
+"""The log of runs: the protocol that `mlflow_tracker` obeys, and in memory `tests/memory_tracker.py`.
 
 A run in a log is named by study, profile, arm and key (spec id and code fingerprint). Starting one that is there
 already continues it, unless it came from elsewhere (`Card.imported`): values of two machines do not meet in one run. A
@@ -6,7 +6,6 @@ point that is logged already is not logged again.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import Literal, NamedTuple, Protocol
@@ -17,6 +16,7 @@ from rhmc.types import Metrics
 VALUES_ONLY = "values_only"  # tag of a run that came from a bundle without its policy
 Status = Literal["running", "finished", "failed", "interrupted"]
 ADOPTED = "adopted"  # tag of a run that other code made: which, and what was compared
+FROM = "from code "  # begins the tag; the code and `:` follow
 
 
 class StudyCard(NamedTuple):
@@ -70,6 +70,21 @@ class Recorded(NamedTuple):
     values_only: bool = False  # taken in from a bundle without policies
     modules: Mapping[str, str] = MappingProxyType({})  # of the code that made it, where that was kept
     adopted: str = ""  # from which code, and what was compared, if another code made it
+
+    @property
+    def spec_id(self) -> str:
+        """The identity of its settings when it was made."""
+        return self.key.partition("-")[0]
+
+    @property
+    def code(self) -> str:
+        """The fingerprint of the code that it is logged under."""
+        return self.key.rpartition("-")[2]
+
+    @property
+    def copied_from(self) -> str:
+        """The code of the run that this one is an adopted copy of; empty if it is none."""
+        return self.adopted.removeprefix(FROM).partition(":")[0]
 
 
 class Row(NamedTuple):
@@ -174,125 +189,3 @@ def points_of(rows: Iterable[Row]) -> list[Metrics]:
     for row in rows:
         points.setdefault(row.step, {"step": float(row.step)})[row.metric] = row.value
     return [points[step] for step in sorted(points)]
-
-
-@dataclass
-class MemoryRun:
-    """A run of the twin."""
-
-    ref: str
-    study: StudyCard
-    card: Card
-    status: Status = "running"
-    values: list[Row] = field(default_factory=list)
-    seen: set[tuple[str, int]] = field(default_factory=set)
-    tags: dict[str, str] = field(default_factory=dict)
-    files: dict[str, bytes] = field(default_factory=dict)
-    models: list[bytes] = field(default_factory=list)
-
-    def log(self, points: Sequence[Metrics]) -> None:
-        """See `RunLog`."""
-        self.values += [Row(self.ref, step, metric, value) for metric, step, value in unseen(points, self.seen)]
-
-    def artifact(self, path: Path) -> None:
-        """See `RunLog`."""
-        self.files[path.name] = path.read_bytes()
-
-    def text(self, name: str, content: str) -> None:
-        """See `RunLog`."""
-        self.files[name] = content.encode()
-
-    def tag(self, name: str, value: str) -> None:
-        """See `RunLog`."""
-        self.tags[name] = value
-
-    def model(self, policy: Path) -> None:
-        """See `RunLog`."""
-        self.models = self.models or [policy.read_bytes()]
-
-    def finish(self, status: Status) -> None:
-        """See `RunLog`."""
-        self.status = status
-
-
-class MemoryTracker:
-    """The twin: what several of them share is `shelf`, as trackers of MLflow share a database."""
-
-    def __init__(self, study: StudyCard, shelf: list[MemoryRun]) -> None:
-        self.study, self.shelf = study, shelf
-        self.note, self.files = study.note, dict[str, bytes]()
-        self._interrupt_running()
-
-    def _mine(self) -> list[MemoryRun]:
-        return [run for run in self.shelf if run.study[:2] == self.study[:2]]
-
-    def _interrupt_running(self) -> None:
-        for run in self._mine():
-            if run.status == "running":
-                run.finish("interrupted")
-
-    def recorded(self) -> list[Recorded]:
-        """See `Tracker`."""
-        return [
-            Recorded(
-                *(r.ref, r.card.arm, r.card.key, r.status, r.card.commit, "stale" in r.tags, r.card.host),
-                *(r.tags.get("error", ""), VALUES_ONLY in r.tags, r.card.modules, r.tags.get(ADOPTED, "")),
-            )
-            for r in self._mine()
-        ]
-
-    def mark(self, ref: str, *, stale: bool) -> None:
-        """See `Tracker`."""
-        (run,) = (run for run in self.shelf if run.ref == ref)
-        if stale:
-            run.tags["stale"] = "yes"
-        else:
-            run.tags.pop("stale", None)
-
-    def finished_anywhere(self, keys: Collection[str]) -> dict[str, str]:
-        """See `Tracker`."""
-        done = [r for r in self.shelf if r.status == "finished" and r.card.key in keys]
-        return {r.card.key: r.ref for r in reversed(done)}
-
-    def start(self, card: Card) -> MemoryRun:
-        """See `Tracker`."""
-        for run in self._mine():
-            if (run.card.arm, run.card.key) == (card.arm, card.key):
-                if run.card.imported != card.imported:
-                    self.drop(run.ref)
-                    continue
-                run.status = "running"
-                return run
-        number = 1 + max((int(run.ref.removeprefix("run-")) for run in self.shelf), default=-1)
-        run = MemoryRun(f"run-{number}", self.study, card)
-        self.shelf.append(run)
-        return run
-
-    def drop(self, ref: str) -> None:
-        """See `Tracker`."""
-        self.shelf[:] = [run for run in self.shelf if run.ref != ref]
-
-    def rows(self, refs: Sequence[str], metrics: Collection[str] | None = None) -> list[Row]:
-        """See `Tracker`."""
-        found = (row for run in self.shelf if run.ref in refs for row in run.values)
-        return sorted(row for row in found if metrics is None or row.metric in metrics)
-
-    def file(self, ref: str, name: str, folder: Path) -> Path | None:
-        """See `Tracker`."""
-        (run,) = [run for run in self.shelf if run.ref == ref]
-        if name not in run.files:
-            return None
-        (folder / name).write_bytes(run.files[name])
-        return folder / name
-
-    def files_of(self, ref: str) -> str:
-        """See `Tracker`."""
-        return f"memory of {ref}"
-
-    def publish(self, note: str, files: Mapping[str, bytes]) -> None:
-        """See `Tracker`."""
-        self.note, self.files = note, self.files | dict(files)
-
-    def close(self, status: Status) -> None:
-        """See `Tracker`."""
-        self._interrupt_running()

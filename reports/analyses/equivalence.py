@@ -167,9 +167,14 @@ COLUMNS = ["study", "arm", "seeds", "difference [95 %]", "p", "outcome", "note"]
 def summary(compared: Sequence[Compared], name: str) -> str:
     """One line: how the results here stand to those of that name."""
     if all(one.outcome == "byte-equal" for one in compared):
-        return f"byte-equal to the published {name} results: {len(compared)} arms"
+        return f"byte-equal to the published {name} results: {_arms(len(compared))}"
     counts = {outcome: sum(one.outcome == outcome for one in compared) for one in compared for outcome in [one.outcome]}
-    return f"against the published {name} results: " + ", ".join(f"{n} arms {outcome}" for outcome, n in counts.items())
+    parts = [f"{_arms(n)} {outcome}" for outcome, n in counts.items()]
+    return f"against the published {name} results: {', '.join(parts)}"
+
+
+def _arms(count: int) -> str:
+    return f"{count} arm{'s' * (count != 1)}"
 
 
 def _shown(interval: Interval) -> str:

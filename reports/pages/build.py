@@ -1,6 +1,5 @@
-"""Build a report: `python -m reports.pages.build --profile quick`. The same tables give the same bytes."""
+"""Build a report, as `rhmc report` does. The same tables give the same bytes."""
 
-import argparse
 import fcntl
 import json
 import math
@@ -142,27 +141,28 @@ def _held(out: Path) -> Iterator[None]:
         os.close(folder)
 
 
-def main(argv: Sequence[str] | None = None, shown: Callable[[str], str] = str) -> int:
-    """Build the report of a profile from its exported tables.
+def write_report(
+    runs: Path | None,
+    out: Path | None,
+    profile: str = "quick",
+    study: str | None = None,
+    shown: Callable[[str], str] = str,
+) -> int:
+    """Build a report as `build` does, and say on the terminal what became of it.
 
     Args:
-        argv: the options.
+        runs: folder of the tables; results/PROFILE/runs if None.
+        out: folder of the report; results/PROFILE, with study/STUDY after it for one study, if None.
+        profile: that made the runs.
+        study: report on this one alone.
         shown: how a message is printed, which names folders as they were typed.
 
     Returns 0, 1 if a figure could not be drawn, 2 if the tables are faulty: then nothing is written.
     """
-    parser = argparse.ArgumentParser(
-        prog="python -m reports.pages.build", description=(main.__doc__ or "").partition("\n")[0]
-    )
-    parser.add_argument("--profile", default="quick", help="profile that made the runs (default: quick)")
-    parser.add_argument("--study", help="report on this study alone")
-    parser.add_argument("--runs", type=Path, help="folder of the tables (default: results/PROFILE/runs)")
-    parser.add_argument("--out", type=Path, help="folder of the report (default: results/PROFILE[/study/STUDY])")
-    args = parser.parse_args(argv)
-    home = Path("results") / args.profile
-    out = args.out or (home / "study" / args.study if args.study else home)
+    home = Path("results") / profile
+    out = out or (home / "study" / study if study else home)
     try:
-        built = build(args.runs or home / "runs", out, args.profile, args.study)
+        built = build(runs or home / "runs", out, profile, study)
     except (TableError, PaperError, OutError) as error:
         print(shown(str(error)), file=sys.stderr)
         return BAD
@@ -461,7 +461,8 @@ def _summary(results: Results) -> str:
         said = f"{done} of {len(plan)} runs finished, {steps(budget) if budget else 'unknown'} steps each"
         episodes = results.final_episodes(study)
         said += f", final return over {episodes} episodes" if episodes else ""
-        lines.append(f"- **{markdown(study)}**: {prose(question)} ({len(results.arms(study))} arms, {said})")
+        arms = len(results.arms(study))
+        lines.append(f"- **{markdown(study)}**: {prose(question)} ({arms} arm{'s' * (arms > 1)}, {said})")
     return "\n".join(lines) or "No study has runs yet."
 
 
@@ -511,7 +512,3 @@ def _replace(new: Path, old: Path, aside: Path) -> None:
     with suppress(FileNotFoundError):
         old.replace(aside / f"old-{old.name}")
     new.replace(old)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -8,8 +8,10 @@ number between brackets, `[U+57FA]`, so that two names stay two; tables and page
 import unicodedata
 from collections.abc import Callable, Iterator
 from functools import cache
+from pathlib import Path
 from typing import Any
 
+import matplotlib
 from matplotlib import font_manager
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
@@ -29,8 +31,17 @@ LOST = "Letters in square brackets, as [U+57FA], are in no font of the machine t
 @cache
 def families() -> tuple[str, ...]:
     """Of fonts, in the order in which they are asked for a letter."""
+    _take_own_fonts()
     there = set(font_manager.fontManager.get_font_names())
     return ("DejaVu Sans", *(name for name in FALLBACKS if name in there))
+
+
+def _take_own_fonts() -> None:
+    """Let DejaVu be the files that come with matplotlib: a machine may have others, which a PDF holds parts of."""
+    manager = font_manager.fontManager
+    manager.ttflist = [font for font in manager.ttflist if not font.name.startswith("DejaVu")]
+    for path in sorted(Path(matplotlib.get_data_path(), "fonts", "ttf").glob("DejaVu*.ttf")):
+        manager.addfont(path)
 
 
 def settings() -> Any:  # a mapping, as matplotlib types it

@@ -119,7 +119,7 @@ class _Stack(torch.autograd.Function):
 
 
 def _outputs(x: Tensor, after: list[str], params: Sequence[Tensor | None]) -> list[Tensor]:
-    """What each layer puts out: (rows, in) -> (rows, out) each."""
+    """The output of each layer: (rows, in) -> (rows, out) each."""
     outputs = []
     for (weight, bias), kind in zip(_pairs(params), after, strict=True):
         x = product(x, weight, bias, kind)

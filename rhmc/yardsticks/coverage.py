@@ -112,7 +112,7 @@ def toward(turn: Tensor) -> Tensor:
 
 
 def windows(bearing: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
-    """What a sensor can see at once: window j begins at target j and extends less than 90 degrees to the left.
+    """Windows that a sensor can see: window j begins at target j and extends less than 90 degrees to the left.
 
     Every set of targets visible under some heading is part of one of these M sets, and each of them is visible under
     the heading in the middle of its targets.
@@ -132,7 +132,7 @@ def windows(bearing: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _sight(state: State) -> list[Tensor]:
-    """What a sensor would see 1 to T steps ahead, turned by -T to T actions: N times (B, T, M, 2T + 1).
+    """The view of a sensor 1 to T steps ahead, turned by -T to T actions: N times (B, T, M, 2T + 1).
 
     0 is out of sight, about 1 in sight: a little more near the axis, where a target that turns is not lost at once.
     """

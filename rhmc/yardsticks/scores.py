@@ -84,7 +84,7 @@ def _episodes(cfg: EnvConfig, name: str, episodes: int, seed: int) -> dict[str, 
 
 
 def _policy(cfg: EnvConfig, name: str, batch: int, world: Generator, own: Generator) -> Iterator[dict[str, Tensor]]:
-    """What each step of one episode per row logs."""
+    """The logged values of each step, one episode per row."""
     physics, act = ENVS[cfg.kind].physics, POLICIES[cfg.kind][name]
     state = physics.initial(cfg, batch, world)
     for _ in range(physics.spec(cfg).episode):

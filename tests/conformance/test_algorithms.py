@@ -12,6 +12,8 @@ from torch import Generator, Tensor
 from torch.nn import functional
 from torch.overrides import TorchFunctionMode
 
+from pipelines.specs.document import settings
+from pipelines.tracking.plan import flatten
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import ENVS, Task, coverage, make_env, navigation
 from rhmc.envs.base import Env
@@ -20,9 +22,9 @@ from rhmc.networks.nets import Unshared
 from rhmc.training.trainer import Config, Trainer
 from rhmc.types import Batch, Obs, Transition
 from tests import toy
-from tests.blocks import fields, fitted, flat, nested
+from tests.blocks import fitted, nested
 from tests.conformance import DifferentError, assert_same
-from tests.support import seeded, through_a_file
+from tests.support import reordered, seeded, through_a_file
 
 EPISODE = 7  # of both tasks here, so that runs of a few steps cross its end
 SMALL = {
@@ -98,7 +100,7 @@ UNSHARED = {f"{kind} unshared": Case(settle(kind, share=False), TASKS["navigatio
 SCALE = {  # RHMC has one for each level, in variants of its own
     kind: name
     for kind, name in product(ALGORITHMS, ("standardise", "coordinator.standardise"))
-    if kind != "rhmc" and name in fields(ALGORITHMS[kind].config)
+    if kind != "rhmc" and name in settings(ALGORITHMS[kind].config)
 }
 SCALED = {
     f"{kind} {scale}": Case(settle(kind, **{name: scale}), TASKS["navigation"])
@@ -418,10 +420,6 @@ def test_greedy_acting_is_not_random_and_exploring_is_decided_by_the_generator(c
         assert drawn.unique().tolist() == list(range(env.spec.actions))
 
 
-def reorder(obs: Obs, order: list[int]) -> Obs:
-    return Obs(obs.agents[:, order], obs.pairs[:, order], obs.peers[:, order][:, :, order], obs.first)
-
-
 EXTENDED: list[Any] = [
     coverage.Config(agents=4, targets=5, observation="extended"),
     navigation.Config(agents=4, observation="extended", episode=EPISODE),
@@ -440,7 +438,7 @@ def test_reordering_agents_reorders_what_they_do(kind: str, cfg: Any) -> None:
         _shift(state, 1.0)
         algo.load_state_dict(state)
         (action, _, extra), (moved, _, told) = (
-            algo.act(x, algo.carry(30), seeded(), explore=False) for x in (obs, reorder(obs, order))
+            algo.act(x, algo.carry(30), seeded(), explore=False) for x in (obs, reordered(obs, order))
         )
         done = [(action, moved)] + [(extra[key], told[key]) for key in extra.keys() & {"assignment"}]
         assert all(torch.equal(after, before[:, order]) for before, after in done)
@@ -511,7 +509,7 @@ class Targets(TorchFunctionMode):
 def plain(algo: Any, **changes: Any) -> Any:
     """A method's settings with those of `PLAIN` and `changes` that it has."""
     config = type(algo)
-    return config(**nested(flat(algo.model_dump()) | fitted(config, PLAIN | changes)))
+    return config(**nested(flatten(algo.model_dump()) | fitted(config, PLAIN | changes)))
 
 
 def transition(env: Env, obs: Obs, algo: Any, **changes: Any) -> Transition:
@@ -618,7 +616,7 @@ def test_a_terminal_row_is_worth_its_reward(case: Case) -> None:
 ON_POLICY = {
     name: case
     for name, case in ONE_STEP.items()
-    if {"n_steps", "coordinator.n_steps"} & set(fields(type(case.algo))) and getattr(case.algo, "pretrain", 0) == 0
+    if {"n_steps", "coordinator.n_steps"} & set(settings(type(case.algo))) and getattr(case.algo, "pretrain", 0) == 0
 }
 
 

@@ -15,14 +15,14 @@ from torch import Tensor
 
 from pipelines.export.tables import write_tables
 from pipelines.specs.study import Setting
-from pipelines.tracking.plan import items, study_card
-from pipelines.tracking.tracker import MemoryTracker
+from pipelines.tracking.plan import flatten, items, study_card
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import ENVS
 from rhmc.learning.learner import Learner
 from rhmc.training.trainer import Trainer
 from rhmc.yardsticks.scores import play_yardsticks
-from tests.blocks import fitted, flat, nested
+from tests.blocks import fitted, nested
+from tests.memory_tracker import MemoryTracker
 from tests.pipelines.support import tiny
 
 FILE = Path(__file__).with_name("digests.json")
@@ -67,7 +67,7 @@ def setting(task: str, algo: dict[str, Any], **env: Any) -> Setting:
     """A short training."""
     task_fields = {"kind": task, "observation": "extended", **env}
     small = fitted(ALGORITHMS[algo["kind"]].config, SMALL)
-    return Setting.model_validate({"env": task_fields, "algo": nested(small | flat(algo)), "trainer": RUN})
+    return Setting.model_validate({"env": task_fields, "algo": nested(small | flatten(algo)), "trainer": RUN})
 
 
 def _training(task: str, algo: dict[str, Any], **env: Any) -> Callable[[], str]:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from pipelines.tracking.tracker import MemoryRun
+from tests.memory_tracker import MemoryRun
 
 
 @pytest.fixture

@@ -1,17 +1,19 @@
 """A tiny study, also as a program: `python -m tests.pipelines.support HOME POINTS CONCURRENT` launches it."""
 
 import os
+import shutil
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import psutil
 import pytest
 
+from pipelines.cli import main as cli
 from pipelines.specs.identity import code_id
 from pipelines.specs.study import Resources, RunSpec, Setting, Study
 from pipelines.tracking.plan import Item, items
@@ -79,6 +81,30 @@ def plan(study: Study | None = None) -> list[Item]:
     return items(study or tiny(), "abc-dirty")
 
 
+class Said(NamedTuple):
+    """The exit code and the output of a command."""
+
+    code: int
+    out: str
+    err: str
+
+
+def run_rhmc(*words: str) -> int:
+    """The exit code of the command `rhmc`, in this process."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["rhmc", *words])
+        with pytest.raises(SystemExit) as caught:
+            cli.main()
+    return int(caught.value.code or 0)
+
+
+def fresh(folder: Path, template: Path) -> Path:
+    """A work folder with an empty MLflow database."""
+    folder.mkdir(exist_ok=True)
+    shutil.copy(template, folder / "mlflow.db")
+    return folder
+
+
 def jobs_of(module: str, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Fills with the number of processes that a module asks for, each time that it does."""
     seen: list[int] = []
@@ -99,6 +125,15 @@ def started_by(driver: int, name: str = "") -> list[psutil.Process]:
             if os.getsid(process.pid) == driver and process.status() != psutil.STATUS_ZOMBIE:
                 found += [process] if name in " ".join(process.cmdline()) else []
     return found
+
+
+def all_end(driver: int, name: str = "") -> bool:
+    """True if nothing that a driver started, with `name` in its command line, is left within a minute."""
+    for _ in range(600):
+        if not started_by(driver, name):
+            return True
+        time.sleep(0.1)
+    return False
 
 
 def interrupt(home: Path) -> None:

@@ -1,6 +1,7 @@
 """Made-up tables in the exported form, with everything a test may want to plant."""
 
 import json
+import sys
 from collections.abc import Mapping, Sequence
 from hashlib import sha256
 from pathlib import Path
@@ -132,6 +133,13 @@ def write(folder: Path, *tables: Tables) -> Path:
             table = pa.Table.from_pandas(runs.drop(columns=own), preserve_index=False)
             pq.write_table(table.replace_schema_metadata(RUNS_OF_NOW.metadata), folder / f"{name}.runs.parquet")
     return folder
+
+
+def reporting(runs: Path, out: Path, study: str | None = None) -> list[str]:
+    """A command that builds a report in a process of its own."""
+    call = f"write_report(Path({str(runs)!r}), Path({str(out)!r}), study={study!r})"
+    code = f"from pathlib import Path; from reports.pages.build import write_report; raise SystemExit({call})"
+    return [sys.executable, "-c", code]
 
 
 def noisy(mean: float, n: int = 3, spread: float = 1.0) -> list[float]:

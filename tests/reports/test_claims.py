@@ -3,10 +3,11 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
-from reports.claims import Claim, judge
+from reports.claims import Claim, _converged, _reached, judge
 from reports.data.frame import load
 from reports.data.paper import read
 from reports.data.stats import Interval
@@ -260,3 +261,127 @@ def test_an_interval_that_is_none_decides_nothing() -> None:
     nothing = Interval(5.0, float("nan"), float("nan"), 1)
     assert not nothing.above(0)
     assert not nothing.below(9)
+
+
+# Thresholds, each with a case on either side
+
+
+@pytest.mark.parametrize(
+    ("level", "verdict"), [(65.4, "partly"), (65.6, "reproduced"), (75.4, "reproduced"), (75.6, "partly")]
+)
+def test_about_70_is_within_five_points(tmp_path: Path, level: float, verdict: str) -> None:
+    assert verdicts(tmp_path, study("coverage", arms(level), steps=PAPER))["C3"].verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("qmix", "verdict"), [(54.9, "partly"), (55.1, "reproduced"), (64.9, "reproduced"), (65.1, "partly")]
+)
+def test_near_60_is_within_five_points(tmp_path: Path, qmix: float, verdict: str) -> None:
+    table = study("coverage", arms(70, OTHERS | {"QMIX": qmix}), steps=PAPER)
+    assert verdicts(tmp_path, table)["C4"].verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("step", "verdict"),
+    [(750_000, "partly"), (1_000_000, "reproduced"), (2_000_000, "reproduced"), (2_250_000, "partly")],
+)
+def test_a_peak_lies_between_one_and_two_million_steps(tmp_path: Path, step: int, verdict: str) -> None:
+    table = peaked(study("coverage", arms(70), steps=PAPER), ["MADDPG", "MAPPO"], step)
+    assert verdicts(tmp_path, table)["C5"].verdict == verdict
+
+
+@pytest.mark.parametrize(("budget", "testable"), [(1_980_000, False), (2_000_000, True)])
+def test_a_peak_needs_two_million_steps(tmp_path: Path, budget: int, testable: bool) -> None:
+    found = verdicts(tmp_path, study("coverage", arms(70), steps=budget))["C5"]
+    assert (found.verdict != "untestable") == testable
+
+
+@pytest.mark.parametrize(("last", "verdict"), [(55.1, "reproduced"), (54.9, "partly")])
+def test_stable_is_no_fall_by_more_than_five_points(tmp_path: Path, last: float, verdict: str) -> None:
+    assert verdicts(tmp_path, sensors([50, 60, last], [40, 50, 40]))["C7"].verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("without", "verdict"), [(28.4, "partly"), (28.7, "reproduced"), (42.5, "reproduced"), (42.8, "partly")]
+)
+def test_a_loss_of_the_stated_size_is_within_ten_points(tmp_path: Path, without: float, verdict: str) -> None:
+    """The paper's is 49.5 %, so that 70.5 falls to between 28.55 and 42.65."""
+    assert verdicts(tmp_path, ablation(70.5, without, 55.1))["C8"].verdict == verdict
+
+
+@pytest.mark.parametrize(("budget", "testable"), [(2_990_000, False), (3_000_000, True)])
+def test_convergence_needs_three_million_steps(tmp_path: Path, budget: int, testable: bool) -> None:
+    table = study("ablation", {"full": noisy(70), "no filter": noisy(60)}, steps=budget)
+    assert (verdicts(tmp_path, table)["C10"].verdict != "untestable") == testable
+
+
+def test_convergence_by_hand() -> None:
+    """From the first of the points that stay at 95 % of the mean of the last tenth."""
+    at = range(0, 2000, 100)
+    assert _converged(pd.Series([94.9] * 10 + [95.0] * 8 + [98.0, 102.0], at)) == 1000
+    assert _converged(pd.Series([96.0] * 5 + [94.9] + [96.0] * 12 + [98.0, 102.0], at)) == 600, "it fell again"
+    assert _converged(pd.Series([95.0] * 18 + [98.0, 102.0], at)) == 0
+    assert _converged(pd.Series([100.0] * 18 + [110.0, 90.0], at)) == 1900, "below to the end"
+    assert _converged(pd.Series([1.0, np.nan, 7.0], [0, 100, 200])) == 200
+
+
+def test_reaching_by_hand() -> None:
+    """The first point at 90 % of a seed's own final return, else the last."""
+    rows = pd.DataFrame({0: [0.0, 8.9, 9.0, 10.0], 1: [0.0, 1.0, 2.0, 3.0], 2: [0.0, 9.1, 1.0, np.nan]})
+    rows.index = pd.Index([0, 100, 200, 300])
+    assert _reached(rows, np.array([10.0, 10.0, 10.0])).tolist() == [200, 300, 100]
+
+
+@pytest.mark.parametrize(
+    ("ours", "verdict", "side"),
+    [
+        (75.4, "untestable", "not above"),
+        (75.6, "contradicted by the paper itself", "not above"),
+        (65.6, "untestable", "not above"),
+        (65.4, "contradicted by the paper itself", "not above"),
+        (86.9, "contradicted by the paper itself", "not above"),
+        (87.1, "contradicted by the paper itself", "above"),
+    ],
+)
+def test_another_number_is_more_than_five_points_away(tmp_path: Path, ours: float, verdict: str, side: str) -> None:
+    """The other number is 70.5, and the bound 86.4 with a standard error of 0.3."""
+    paper = read()
+    numbers = {"RHMC": ours, "QMIX": 61.0, "COMA": 50.0}
+    claims = dict(paper.claims) | {"C12": paper.claims["C12"].model_copy(update={"numbers": numbers})}
+    results = load(write(tmp_path, study("coverage", arms(70)), yardsticks()), "quick")
+    (found,) = (c for c in judge(results, paper.model_copy(update={"claims": claims})) if c.id == "C12")
+    assert found.verdict == verdict
+    assert f"{ours:g} is {side} the 86.4" in found.reason
+
+
+@pytest.mark.parametrize(("most", "verdict"), [(0.0, "untestable"), (0.1, "contradicted by the paper itself")])
+def test_a_sum_of_negative_distances_may_be_zero(tmp_path: Path, most: float, verdict: str) -> None:
+    paper = read()
+    changed = paper.claims["C11"].model_copy(update={"numbers": {"RHMC": most, "QMIX": -30.0}})
+    results = load(write(tmp_path, study("coverage", arms(70))), "quick")
+    found = judge(results, paper.model_copy(update={"claims": dict(paper.claims) | {"C11": changed}}))
+    assert [claim.verdict for claim in found if claim.id == "C11"] == [verdict]
+
+
+@pytest.mark.parametrize(
+    ("budget", "seeds", "caveats"),
+    [
+        (PAPER, 5, ()),
+        (PAPER + 1_000, 5, ()),
+        (PAPER - 1_000, 5, ("5 M of the paper's 5 M steps (1e+02 %)",)),
+        (PAPER, 4, ("4 seeds",)),
+    ],
+)
+def test_what_makes_a_verdict_provisional(tmp_path: Path, budget: int, seeds: int, caveats: tuple[str, ...]) -> None:
+    finals = {"full": noisy(70.5, seeds), "no regulation": noisy(35.6, seeds)}
+    found = verdicts(tmp_path, study("ablation", finals, steps=budget))["C8"]
+    assert (found.verdict, found.caveats, found.provisional) == ("reproduced", caveats, bool(caveats))
+
+
+def test_the_reason_of_c13_states_shares_and_the_largest_gap(tmp_path: Path) -> None:
+    found = verdicts(tmp_path / "lost", study("coverage", arms(70)), theorem(40))["C13"]
+    assert found.reason == (
+        "Below the optimum in 4.0 % to 8.0 % of random instances, by size and density, and by up to 1.10 of reward."
+    )
+    none = verdicts(tmp_path / "none", study("coverage", arms(70)), theorem(0))["C13"]
+    assert none.reason == "No loss in 2,000 instances."

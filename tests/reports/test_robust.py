@@ -5,7 +5,6 @@ import os
 import re
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -21,9 +20,9 @@ from reports.data import paper
 from reports.data.frame import TableError, load
 from reports.pages import build as report
 from reports.pages import gallery
-from reports.pages.build import build, main
+from reports.pages.build import build, write_report
 from reports.render import diagrams, figures, tables
-from tests.reports.factory import drawings, episode, methods, noisy, study, write, yardsticks
+from tests.reports.factory import drawings, episode, methods, noisy, reporting, study, write, yardsticks
 from tests.reports.hostile import Page
 
 pytestmark = pytest.mark.usefixtures("quick_resampling")
@@ -147,7 +146,7 @@ def test_a_table_of_another_form_is_a_line_and_the_old_report_stays(
     old = tmp_path / "out" / "index.html"
     old.parent.mkdir()
     old.write_text("old")
-    assert main(["--runs", str(tmp_path / "runs"), "--out", str(old.parent)]) == 2
+    assert write_report(tmp_path / "runs", old.parent) == 2
     said = capsys.readouterr()
     assert line in said.err
     assert len(said.err.splitlines()) <= 6  # a line a fault, and of each kind the first five
@@ -206,7 +205,7 @@ def test_a_malformed_paper_is_a_line(
     assert old in STATED
     monkeypatch.setattr(paper, "FILE", tmp_path / "paper.yaml")
     paper.FILE.write_text(STATED.replace(old, new, 1), encoding="utf-8")
-    assert main(["--runs", str(fresh(tmp_path / "runs")), "--out", str(tmp_path / "out")]) == 2
+    assert write_report(fresh(tmp_path / "runs"), tmp_path / "out") == 2
     said = capsys.readouterr().err.splitlines()
     assert any(line in one for one in said)
     assert all(one.startswith("paper.yaml: ") for one in said)
@@ -279,7 +278,7 @@ def test_a_figure_that_cannot_be_saved_leaves_its_numbers(
 
     monkeypatch.setattr(figures, "learning_curves", broken)
     out = tmp_path / "out"
-    assert main(["--runs", str(fresh(tmp_path / "runs")), "--out", str(out)]) == 1
+    assert write_report(fresh(tmp_path / "runs"), out) == 1
     said = capsys.readouterr()
     assert said.err == "curves_reach: could not be drawn (ValueError: no ink)\n"
     assert "start with" in said.out
@@ -316,8 +315,8 @@ def test_evidence_that_fails_is_an_error(
 
 def test_what_a_killed_report_left_is_swept(tmp_path: Path) -> None:
     runs, out = fresh(tmp_path / "runs"), tmp_path / "out"
-    call = [sys.executable, "-m", "reports.pages.build", "--runs", str(runs), "--out", str(out), "--study", "reach"]
-    child = subprocess.Popen(call, cwd=Path(__file__).parents[2], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    root, silent = Path(__file__).parents[2], subprocess.DEVNULL
+    child = subprocess.Popen(reporting(runs, out, "reach"), cwd=root, stdout=silent, stderr=silent)
     end = time.monotonic() + 120
     while not list(out.glob(".report-*/figures/*")) and child.poll() is None and time.monotonic() < end:
         time.sleep(0.005)
@@ -334,7 +333,7 @@ def test_what_a_killed_report_left_is_swept(tmp_path: Path) -> None:
 def test_two_reports_in_one_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     runs, out = fresh(tmp_path / "runs"), tmp_path / "out"
     with report._held(out):
-        assert main(["--runs", str(runs), "--out", str(out)]) == 2
+        assert write_report(runs, out) == 2
     assert capsys.readouterr().err == f"{out}: another report is being written there; wait for it, or give --out\n"
     assert list(out.iterdir()) == []
 
@@ -343,7 +342,7 @@ def test_a_place_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     runs = fresh(tmp_path / "runs")
     (tmp_path / "file").write_text("mine")
     for out in (tmp_path / "file", tmp_path / "file" / "below", tmp_path / ("x" * 300)):
-        assert main(["--runs", str(runs), "--out", str(out)]) == 2
+        assert write_report(runs, out) == 2
         assert f"{out}: cannot be written (" in capsys.readouterr().err
     assert (tmp_path / "file").read_text() == "mine"
 
@@ -359,7 +358,7 @@ def test_no_place_for_tables(name: str, words: str, tmp_path: Path) -> None:
 def test_nothing_depends_on_the_locale(tmp_path: Path) -> None:
     runs, out = write(tmp_path / "runs", study("reach", {"基线": noisy(60)}, points=2)), tmp_path / "out"
     env = os.environ | {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
-    call = [sys.executable, "-m", "reports.pages.build", "--runs", str(runs), "--out", str(out), "--study", "reach"]
+    call = reporting(runs, out, "reach")
     done = subprocess.run(call, cwd=Path(__file__).parents[2], env=env, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert "基线" in (out / "index.html").read_text(encoding="utf-8")

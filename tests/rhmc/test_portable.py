@@ -1,4 +1,4 @@
-"""What the C library is told about freed memory."""
+"""The C library keeps freed memory."""
 
 import platform
 

@@ -111,7 +111,7 @@ def exported(home: Path, bundle: Path) -> int:
 
 def reported(home: Path, bundle: Path) -> int:
     """`rhmc report`, from tables that were exported before."""
-    return build.main(["--study", STUDY.name, "--runs", str(home.parent / "tables"), "--out", str(home / OUT)])
+    return build.write_report(home.parent / "tables", home / OUT, study=STUDY.name)
 
 
 def imported(home: Path, packed: Path) -> int:

@@ -4,7 +4,6 @@
 """
 
 import random
-import shutil
 import sqlite3
 import time
 from contextlib import closing
@@ -15,7 +14,7 @@ from mlflow import MlflowClient
 
 from pipelines.export.tables import export_study
 from tests.depth import often
-from tests.pipelines.support import setting, tiny
+from tests.pipelines.support import fresh, setting, tiny
 from tests.robustness.chaos import KILLED, Run, Server, damage, everything, faults, launch, start_launch
 
 RATES = {"slow": 1e-4, "fast": 1e-2, "twin": 1e-2}  # the last is copied from the one before
@@ -36,13 +35,6 @@ class Whole:
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory, template: Path) -> Whole:
     return Whole(fresh(tmp_path_factory.mktemp("whole"), template))
-
-
-def fresh(folder: Path, template: Path) -> Path:
-    """A work folder with an empty MLflow database."""
-    folder.mkdir(exist_ok=True)
-    shutil.copy(template, folder / "mlflow.db")
-    return folder
 
 
 def table(home: Path) -> bytes:

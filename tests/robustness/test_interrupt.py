@@ -22,7 +22,7 @@ from pipelines.specs.study import Study
 from pipelines.tracking.mlflow_tracker import open_existing
 from pipelines.tracking.plan import study_card
 from pipelines.workspace.work_folder import Home
-from tests.pipelines.support import interrupt, started_by, tiny
+from tests.pipelines.support import all_end, interrupt, started_by, tiny
 from tests.robustness.chaos import WORKER, launch_here
 
 pytestmark = pytest.mark.ray
@@ -54,15 +54,6 @@ def driver(home: Path, concurrent: int) -> subprocess.Popen[str]:
         time.sleep(0.05)
     os.killpg(process.pid, signal.SIGKILL)
     raise AssertionError(process.communicate()[0])
-
-
-def all_end(driver: int, name: str = "") -> bool:
-    """True if nothing that a driver started, with `name` in its command line, is left within a minute."""
-    for _ in range(600):
-        if not started_by(driver, name):
-            return True
-        time.sleep(0.1)
-    return False
 
 
 def statuses(home: Path) -> dict[str, str]:

@@ -13,14 +13,12 @@ from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
 from itertools import product
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
-from pipelines.cli import main as cli
 from pipelines.specs.safe_names import PROFILES, RESERVED, STUDY, folded, simple, slug
 from pipelines.specs.search import Search
 from pipelines.specs.source_file import another, remember
@@ -31,7 +29,7 @@ from pipelines.tracking.tracker import StudyCard
 from pipelines.tuning.best_params import file_name, stem
 from pipelines.workspace.errors import LONGEST, MOST, InputError, visible
 from pipelines.workspace.work_folder import Home
-from tests.pipelines.support import tiny
+from tests.pipelines.support import Said, run_rhmc, tiny
 
 ROOT = Path(__file__).parents[2]
 FILE = """\
@@ -46,12 +44,6 @@ ARMS = ["a b", "a-b", "基线", "消融", "_c", "d [x]", "5$ to 6$ {~}", "$\\x$"
 PIECES = ["a", "b", "B", " ", "-", "_", ".", "$", "é", "基", "\u0301", "ß", "ﬁ", "quick", "deadbeef", "x" * 70]
 
 
-class Said(NamedTuple):
-    code: int
-    out: str
-    err: str
-
-
 @pytest.fixture(autouse=True)
 def _in_a_project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
@@ -61,11 +53,9 @@ def _in_a_project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def rhmc(*words: str) -> Said:
     out, err = StringIO(), StringIO()
-    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
-        patch.setattr(sys, "argv", ["rhmc", *words])
-        with pytest.raises(SystemExit) as caught:
-            cli.main()
-    return Said(int(caught.value.code or 0), out.getvalue(), err.getvalue())
+    with redirect_stdout(out), redirect_stderr(err):
+        code = run_rhmc(*words)
+    return Said(code, out.getvalue(), err.getvalue())
 
 
 def written(arms: list[str], name: str = "x", more: str = "") -> Path:

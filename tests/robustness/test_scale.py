@@ -21,8 +21,9 @@ from pipelines.specs.study import Setting, Study
 from pipelines.tracking.mlflow_tracker import LONGEST, NOTE, MlflowTracker, addresses, fitting
 from pipelines.tracking.overview import Run, so_far
 from pipelines.tracking.plan import LISTED, Item, study_card
-from pipelines.tracking.tracker import MemoryRun, MemoryTracker, Row, StudyCard
+from pipelines.tracking.tracker import Row, StudyCard
 from pipelines.workspace.work_folder import Home
+from tests.memory_tracker import MemoryRun, MemoryTracker
 from tests.pipelines.support import plan, setting, tiny
 
 STUDY = StudyCard("tiny", "quick", "")

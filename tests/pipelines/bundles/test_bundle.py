@@ -36,7 +36,7 @@ from pipelines.workspace.errors import InputError
 from pipelines.workspace.work_folder import Checkpoints, Home, StoreError, load_whole, save_atomically, without_replay
 from rhmc.training.trainer import Config, Trainer, grid_step
 from tests.depth import often
-from tests.pipelines.support import CODE, setting, tiny
+from tests.pipelines.support import CODE, fresh, setting, tiny
 from tests.robustness.chaos import KILLED, everything, faults, import_in_a_process
 
 RATES = {"slow": 1e-4, "fast": 1e-2, "late": 1.0, "none": 0.5}
@@ -44,17 +44,10 @@ STUDY = tiny(arms={arm: setting(lr=rate) for arm, rate in RATES.items()})
 DONE = STUDY.model_copy(update={"arms": {arm: STUDY.arms[arm] for arm in ("slow", "fast")}})  # its runs are finished
 
 
-def made(folder: Path, template: Path) -> Path:
-    """A work folder with an empty MLflow database."""
-    folder.mkdir(exist_ok=True)
-    shutil.copy(template, folder / "mlflow.db")
-    return folder
-
-
 @pytest.fixture(scope="module")
 def here(tmp_path_factory: pytest.TempPathFactory, template: Path) -> Path:
     """Two finished runs, one that has two checkpoints, one that was never begun. Not to be changed."""
-    home = made(tmp_path_factory.mktemp("here"), template)
+    home = fresh(tmp_path_factory.mktemp("here"), template)
     slow, fast, late, _ = items(STUDY, "abc")
     for study in (STUDY, DONE.model_copy(update={"name": "done"})):
         tracker = MlflowTracker(study_card(study), Home(home))
@@ -97,7 +90,7 @@ def bundle(good: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def there(tmp_path_factory: pytest.TempPathFactory, template: Path) -> Path:
-    return made(tmp_path_factory.mktemp("there"), template)
+    return fresh(tmp_path_factory.mktemp("there"), template)
 
 
 def log_of(home: Path, study: Study = STUDY) -> MlflowTracker:
@@ -966,7 +959,7 @@ def test_the_grid_without_counting(steps: int, evaluations: int, copies: int, st
 @pytest.fixture(scope="module")
 def undisturbed(good: Path, tmp_path_factory: pytest.TempPathFactory, template: Path) -> Path:
     """A work folder into which a bundle was taken by a process that nobody disturbed."""
-    home = made(tmp_path_factory.mktemp("undisturbed"), template)
+    home = fresh(tmp_path_factory.mktemp("undisturbed"), template)
     assert import_in_a_process(good, home) == 0, (home / "driver.log").read_text()
     return home
 
@@ -1006,7 +999,7 @@ def test_imports_killed_at_random_writes(good: Path, tmp_path: Path, template: P
     writes = int((undisturbed / "writes").read_text())
     while kills < KILLS:
         campaign += 1
-        home = made(tmp_path / str(campaign), template)
+        home = fresh(tmp_path / str(campaign), template)
         status = KILLED
         while status != 0:
             status = import_in_a_process(good, home, rng.randrange(1, writes) if kills < KILLS else 0)
@@ -1017,7 +1010,7 @@ def test_imports_killed_at_random_writes(good: Path, tmp_path: Path, template: P
 
 
 def test_a_disk_that_is_full_at_first(good: Path, tmp_path: Path, template: Path, undisturbed: Path) -> None:
-    home = made(tmp_path / "home", template)
+    home = fresh(tmp_path / "home", template)
     with closing(sqlite3.connect(home / "mlflow.db")) as database:
         database.execute("VACUUM")  # no free pages: whatever is logged makes it grow
     assert import_in_a_process(good, home, room=(home / "mlflow.db").stat().st_size + 2**13) == 2

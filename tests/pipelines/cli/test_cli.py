@@ -13,22 +13,22 @@ from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
 import pandas as pd
 import pytest
 from typer.main import get_command
 
-from pipelines.cli import main as cli
 from pipelines.cli import ui
 from pipelines.cli.checks import Finding
 from pipelines.cli.doctor import MARK
+from pipelines.cli.main import app
 from pipelines.export import yardsticks
 from pipelines.specs.identity import fingerprint
 from pipelines.workspace.process_pool import KILLED
 from pipelines.workspace.provenance import host
 from rhmc.yardsticks.scores import names
-from tests.pipelines.support import jobs_of
+from tests.pipelines.support import Said, jobs_of, run_rhmc
 from tests.robustness.fleet import wait_for
 
 ROOT = Path(__file__).parents[3]
@@ -41,12 +41,6 @@ arms:
 seeds: 2
 steps: 1000
 """
-
-
-class Said(NamedTuple):
-    code: int
-    out: str
-    err: str
 
 
 Rhmc = Callable[..., Said]
@@ -62,10 +56,7 @@ def rhmc(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureF
     (tmp_path / "studies" / "x.yaml").write_text(STUDY)
 
     def call(*words: str) -> Said:
-        monkeypatch.setattr(sys, "argv", ["rhmc", *words])
-        with pytest.raises(SystemExit) as caught:
-            cli.main()
-        return Said(int(caught.value.code or 0), *capfd.readouterr())
+        return Said(run_rhmc(*words), *capfd.readouterr())
 
     return call
 
@@ -114,7 +105,7 @@ def test_help_ends_with_the_exit_codes(rhmc: Rhmc) -> None:
 
 def test_the_page_of_the_command_line_names_every_verb() -> None:
     page = (ROOT / "docs/cli.md").read_text()
-    group = get_command(cli.app)
+    group = get_command(app)
     verbs = [name for name, one in group.commands.items() if not hasattr(one, "commands")]
     verbs += [f"{name} {verb}" for name, one in group.commands.items() for verb in getattr(one, "commands", ())]
     assert [verb for verb in verbs if verb not in page and verb != "yardsticks navigation"] == []
@@ -360,13 +351,22 @@ def test_an_interrupt_is_130(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> Non
     assert rhmc("study", "run", "studies/x.yaml").code == 130
 
 
-@pytest.mark.parametrize("options", [["--profile", "paper"], ["--profile", "quick", "--runs", "a", "--out", "b"]])
-def test_report_hands_on_its_options(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch, options: list[str]) -> None:
-    calls: list[list[str]] = []
-    build = SimpleNamespace(main=lambda given, shown: calls.append(given) or 2)
+@pytest.mark.parametrize(
+    ("options", "given"),
+    [
+        (["--profile", "paper"], (None, None, "paper", None)),
+        (["--runs", "a", "--out", "b"], (Path("a"), Path("b"), "quick", None)),
+        (["--study", "studies/x.yaml", "--variant", "far"], (None, None, "quick", "x@far")),
+    ],
+)
+def test_report_hands_on_its_options(
+    rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch, options: list[str], given: tuple[object, ...]
+) -> None:
+    calls: list[tuple[object, ...]] = []
+    build = SimpleNamespace(write_report=lambda *given: calls.append(given[:4]) or 2)
     monkeypatch.setitem(sys.modules, "reports.pages.build", build)
     assert rhmc("report", *options).code == 2
-    assert calls == [options]
+    assert calls == [given]
 
 
 # Yardsticks

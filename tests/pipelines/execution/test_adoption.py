@@ -16,12 +16,13 @@ from pipelines.export.tables import write_tables
 from pipelines.specs.study import Study
 from pipelines.tracking.mlflow_tracker import MlflowTracker, open_existing
 from pipelines.tracking.plan import Item, items, resolved_yaml, study_card
-from pipelines.tracking.tracker import MemoryTracker, Recorded
+from pipelines.tracking.tracker import Recorded
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.provenance import Host
 from pipelines.workspace.work_folder import Home
 from rhmc.training.trainer import Trainer
 from rhmc.types import Metrics
+from tests.memory_tracker import MemoryTracker
 from tests.pipelines.support import setting, tiny
 
 STUDY = tiny(arms={"slow": setting(lr=1e-4), "fast": setting(lr=1e-2)})
@@ -55,7 +56,7 @@ def planted(tracker: MemoryTracker, arm: str, step: int, metric: str) -> tuple[f
 
 
 def arms(found: Mapping[str, Sequence[Older]]) -> dict[str, list[str]]:
-    return {arm: [one.code for one in some] for arm, some in found.items()}
+    return {arm: [one.run.code for one in some] for arm, some in found.items()}
 
 
 def test_what_can_be_adopted_is_what_is_finished_under_other_code() -> None:

@@ -16,9 +16,10 @@ from pipelines.execution.run import run_studies
 from pipelines.specs.study import Study
 from pipelines.tracking.mlflow_tracker import MlflowTracker, open_existing
 from pipelines.tracking.plan import study_card
-from pipelines.tracking.tracker import MemoryRun, MemoryTracker, StudyCard, points_of
+from pipelines.tracking.tracker import StudyCard, points_of
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.work_folder import Home, StoreError
+from tests.memory_tracker import MemoryRun, MemoryTracker
 from tests.pipelines.support import CODE, plan, setting, tiny
 from tests.robustness.chaos import fit_here
 

@@ -33,10 +33,11 @@ from pipelines.export.tables import export_study
 from pipelines.specs.study import Study
 from pipelines.tracking.mlflow_tracker import MlflowTracker, open_existing
 from pipelines.tracking.plan import Item, commit, items, study_card, what_varies
-from pipelines.tracking.tracker import MemoryRun, MemoryTracker, StudyCard, points_of
+from pipelines.tracking.tracker import StudyCard, points_of
 from pipelines.workspace.work_folder import Checkpoints, Home, StoreError
 from rhmc.algorithms import iql
 from rhmc.training.trainer import Trainer
+from tests.memory_tracker import MemoryRun, MemoryTracker
 from tests.pipelines.support import CODE, plan, setting, spec, tiny
 from tests.robustness.chaos import fit_here
 
@@ -455,6 +456,24 @@ def test_a_server_that_is_not_mlflow(
     message = capsys.readouterr().err
     assert uri in message
     assert message.count("\n") == 1
+
+
+@pytest.mark.parametrize(("done", "code"), [(0, 1), (1, 1), (2, 0)])
+def test_the_status_as_json_has_the_exit_code_of_the_table(
+    done: int, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tracker = MemoryTracker(study_card(tiny()), [])
+    for item in plan()[:done]:
+        tracker.start(item.card).finish("finished")
+    for name, value in (("own", True), ("remarks", [])):
+        monkeypatch.setattr(tracker, name, value, raising=False)
+    monkeypatch.setattr("pipelines.tracking.mlflow_tracker.open_existing", lambda *given: tracker)
+    assert show_status(tiny(), tmp_path) == code
+    capsys.readouterr()
+    assert show_status(tiny(), tmp_path, as_json=True) == code
+    told = json.loads(capsys.readouterr().out)
+    assert told["finished"] == (code == 0)
+    assert sum(arm["finished"] for arm in told["arms"].values()) == done
 
 
 def test_the_status_before_anything_ran(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

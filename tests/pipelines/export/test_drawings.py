@@ -178,3 +178,17 @@ def test_a_file_is_no_folder_and_a_closed_one_is_said(tmp_path: Path) -> None:
         export_drawings(tmp_path / "x")
     with pytest.raises(StoreError, match=r"modules.json: cannot be written"):
         export_drawings(tmp_path / "x" / "y")
+
+
+def test_the_drawings_are_of_what_the_report_says_they_are(scenes: Record) -> None:
+    found = scenes["regulation"]
+    assert (found["alpha"], found["horizon"]) == (0.1, 6)
+    assert found["met"] == [
+        {"horizon": 1, "states": 4800, "lost": 1, "max_gap": 0.5},
+        {"horizon": 6, "states": 4800, "lost": 40, "max_gap": 1.1},
+    ]
+    assert [path["reward"] for path in found["paths"].values()] == [0.8, 1.233333]
+    assert (scenes["navigation"]["radius"], scenes["navigation"]["near"]) == (0.15, 0.1)
+    assert {state["step"] for state in scenes["coverage"]} == {50}
+    first = scenes["coverage"][0]
+    assert (first["sensors"], first["heading"]) == ([[294.0, 316.0], [403.0, -433.0]], [90.5201, -96.6723])

@@ -11,14 +11,14 @@ import pytest
 from typer.testing import CliRunner
 
 from pipelines.cli.main import app
-from pipelines.export.published import folder, publish, retrain
+from pipelines.export.published import Again, folder, publish, retrain
 from pipelines.export.tables import VERSION, write_tables
 from pipelines.specs.study import Study
 from pipelines.tracking.plan import items, study_card
-from pipelines.tracking.tracker import MemoryTracker
 from pipelines.workspace.errors import InputError
 from reports.analyses.equivalence import read
 from rhmc.training.trainer import Trainer
+from tests.memory_tracker import MemoryTracker
 from tests.pipelines.support import setting, tiny
 
 STUDY = tiny(arms={"slow": setting(lr=1e-4), "fast": setting(lr=1e-2)}).model_copy(update={"seeds": 2})
@@ -95,7 +95,7 @@ def test_what_is_published_by_the_command_is_equal_to_what_it_is_of(exported: Pa
     moved = verify("--runs", edited(exported, tmp_path / "a", 3.0, "fast"))
     assert (moved.code, moved.text.splitlines()[-1]) == (
         1,
-        "against the published quick results: 1 arms not shown to be equivalent, 1 arms byte-equal",
+        "against the published quick results: 1 arm not shown to be equivalent, 1 arm byte-equal",
     )
 
 
@@ -104,8 +104,8 @@ def test_shifted_arms(exported: Path, tmp_path: Path) -> None:
     said = verify("--runs", edited(exported, tmp_path / "a", 3.0, "fast"))
     assert said.code == 1
     assert "+3.00" in said.text
-    assert "1 arms not shown to be equivalent" in said.text
-    assert "1 arms byte-equal" in said.text
+    assert "1 arm not shown to be equivalent" in said.text
+    assert "1 arm byte-equal" in said.text
     wide = verify("--runs", tmp_path / "a", "--margin", "1e6")
     assert (wide.code, "equivalent" in wide.text) == (0, True)
 
@@ -172,6 +172,39 @@ def test_runs_trained_anew(exported: Path, monkeypatch: pytest.MonkeyPatch) -> N
     said = verify("--retrain", "3", "--jobs", "1", "--seed", "1")
     assert said.code == 1
     assert "first difference: seed" in " ".join(said.text.split())
+
+
+def test_the_seed_draws_the_runs_that_are_trained_anew(exported: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipelines.export.published._train", lambda spec: [])
+    _, runs = read(exported)
+
+    def drawn(seed: int, count: int = 2) -> list[tuple[str, int]]:
+        return [(one.arm, one.seed) for one in retrain(runs, count, seed, 1)]
+
+    assert drawn(3) == drawn(3)
+    assert len({one for seed in range(20) for one in drawn(seed)}) == 4
+    assert [len(drawn(0, count)) for count in (1, 2, 4, 9)] == [1, 2, 4, 4]
+
+
+@pytest.mark.parametrize(("moved", "margin", "code"), [(0.98, [], 0), (1.02, [], 1), (1.02, ["--margin", "1.1"], 0)])
+def test_options_of_what_is_trained_anew(
+    exported: Path, monkeypatch: pytest.MonkeyPatch, moved: float, margin: list[str], code: int
+) -> None:
+    publish(*read(exported), "quick")
+    values, _ = read(exported)
+    asked: list[tuple[int, int, int]] = []
+
+    def train(runs: pd.DataFrame, count: int, seed: int, jobs: int) -> list[Again]:
+        asked.append((count, seed, jobs))
+        groups = values[values["arm"] == "slow"].groupby(["seed", "run"])
+        return [
+            Again("tiny", "slow", int(str(one)), run, [(x.step, x.metric, x.value + moved) for x in rows.itertuples()])
+            for (one, run), rows in groups
+        ]
+
+    monkeypatch.setattr("pipelines.export.published.retrain", train)
+    assert verify("--retrain", "3", "--seed", "7", "--jobs", "5", *margin).code == code
+    assert asked == [(3, 7, 5)]
 
 
 def test_a_published_run_whose_settings_are_not_its_own(exported: Path) -> None:

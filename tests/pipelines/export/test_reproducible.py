@@ -15,10 +15,10 @@ from pipelines.export.tables import MADE, METRICS, PLACE, RUNS, write_tables
 from pipelines.export.yardsticks import Evaluation, Scored, export_yardsticks
 from pipelines.policies.transfer import TRANSFER
 from pipelines.tracking.plan import items, study_card
-from pipelines.tracking.tracker import MemoryTracker
 from pipelines.workspace.provenance import Host
 from reports.pages import build
 from rhmc.envs import coverage
+from tests.memory_tracker import MemoryTracker
 from tests.pipelines.support import setting, tiny
 
 ROOT = Path(__file__).parents[3]

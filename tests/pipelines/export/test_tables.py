@@ -13,11 +13,11 @@ from pipelines.export.tables import MADE, METRICS, READINGS, RUNS, export_study,
 from pipelines.specs.readings import Cell, Plan
 from pipelines.specs.study import RunSpec, Study
 from pipelines.tracking.plan import Item, items, study_card
-from pipelines.tracking.tracker import MemoryRun, MemoryTracker
 from pipelines.workspace.provenance import Host, host
 from pipelines.workspace.work_folder import StoreError
 from reports.data.exported import FORMS
 from reports.data.frame import TableError, load
+from tests.memory_tracker import MemoryRun, MemoryTracker
 from tests.pipelines.support import CODE, plan, tiny
 
 POINTS = [
@@ -195,6 +195,24 @@ def test_the_hours_of_a_study_follow_the_pace_of_finished_runs(tracker: MemoryTr
     assert estimated(once, tmp_path).startswith("about 3.3 hours of one run at a time")
     (tmp_path / "tiny.made.parquet").write_bytes(b"PAR1")
     assert estimated(study, tmp_path) == ""
+
+
+@pytest.mark.parametrize(("done", "code"), [(1, 1), (2, 0)])
+def test_half_a_study_is_written_and_has_its_exit_code(
+    done: int,
+    code: int,
+    tracker: MemoryTracker,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for item in plan()[:done]:
+        log(tracker, item)
+    monkeypatch.setattr("pipelines.tracking.mlflow_tracker.open_existing", lambda *given: tracker)
+    assert export_study(tiny(), tmp_path / "out", tmp_path / "none") == code
+    assert capsys.readouterr().err == ("tiny (quick): 1 of 2 runs are not finished\n" if code else "")
+    _, table = read(tmp_path / "out")
+    assert sorted(table.status) == sorted(["finished"] * done + ["missing"] * (2 - done))
 
 
 def test_nothing_logged_yet(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,7 +7,6 @@ import pandas as pd
 import pytest
 import torch
 
-from pipelines.cli import main as cli
 from pipelines.policies import assignments
 from pipelines.policies.assignments import Watch, counts, export_assignments, rows_of, watched
 from pipelines.specs.study import Study
@@ -17,7 +16,7 @@ from rhmc.hierarchy.theorem import smallest_counterexample
 from rhmc.training.trainer import Trainer
 from rhmc.types import Local, Obs, Transition
 from tests.blocks import fitted, nested
-from tests.pipelines.support import jobs_of, setting, tiny
+from tests.pipelines.support import jobs_of, run_rhmc, setting, tiny
 
 
 def rhmc_study() -> Study:
@@ -140,10 +139,7 @@ def test_the_command_writes_the_table(
     seen = jobs_of("pipelines.policies.assignments", monkeypatch)
     small = ("steps=512", "trainer.evaluations=1", "trainer.eval_episodes=2", "trainer.final_episodes=2")
     words += [word for one in small for word in ("--set", one)]
-    monkeypatch.setattr("sys.argv", ["rhmc", "assignments", *words])
-    with pytest.raises(SystemExit) as left:
-        cli.main()
-    assert left.value.code == 0
+    assert run_rhmc("assignments", *words) == 0
     assert capsys.readouterr().err == f"wrote {tmp_path / 'out' / 'ablation.assignments.parquet'}\n"
     table = pd.read_parquet(tmp_path / "out" / "ablation.assignments.parquet")
     assert table["metric"].str.startswith("assign/").all()

@@ -1,7 +1,6 @@
 """Animations: what they show is what happened, they are small, and they change nothing."""
 
 import io
-import sys
 from pathlib import Path
 
 import pytest
@@ -9,7 +8,6 @@ import torch
 from PIL import Image
 from torch import Generator
 
-from pipelines.cli import main as cli
 from pipelines.execution.trainable import RunTrainable
 from pipelines.policies import animation, render
 from pipelines.policies.animation import Panel, Scene, gif
@@ -23,6 +21,7 @@ from rhmc.training.evaluation import evaluate
 from rhmc.training.trainer import Trainer
 from rhmc.yardsticks import BOUNDS
 from tests.pipelines.execution.test_trainable import finish, job, same
+from tests.pipelines.support import run_rhmc
 from tests.pipelines.tracking.test_policy import run
 
 
@@ -179,20 +178,13 @@ def test_an_animation_that_fails_is_noted_and_the_run_goes_on(tmp_path: Path, mo
 # The command
 
 
-def rhmc(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["rhmc", "render", *words])
-    with pytest.raises(SystemExit) as left:
-        cli.main()
-    return int(left.value.code or 0)
-
-
 def test_the_command_draws_a_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("RHMC_HOME", raising=False)
     policy.save(tmp_path / "policy.pt", saved(run("iql")))
-    assert rhmc(monkeypatch, "policy.pt", "--out", "a.gif", "--beside", "best_window", "--frames", "4") == 0
+    assert run_rhmc("render", "policy.pt", "--out", "a.gif", "--beside", "best_window", "--frames", "4") == 0
     assert capsys.readouterr().err == "wrote a.gif\n"
     assert len(frames((tmp_path / "a.gif").read_bytes())) == 4
     for words, said in {
@@ -205,14 +197,14 @@ def test_the_command_draws_a_file(
             "b.gif",
         ): f"{tmp_path}/work/mlflow.db: nothing is logged yet, so there is no run {'f' * 32}\n",
     }.items():
-        assert rhmc(monkeypatch, *words) == 2
+        assert run_rhmc("render", *words) == 2
         assert capsys.readouterr().err == said
     study = str(Path(__file__).parents[3] / "studies" / "ablation.yaml")
-    assert rhmc(monkeypatch, study, "--arm", "full", "--out", "b.gif") == 2
+    assert run_rhmc("render", study, "--arm", "full", "--out", "b.gif") == 2
     assert capsys.readouterr().err.startswith("ablation (quick): no such run has a policy yet; ")
-    assert rhmc(monkeypatch, study, "--arm", "ful", "--out", "b.gif") == 2
+    assert run_rhmc("render", study, "--arm", "ful", "--out", "b.gif") == 2
     assert "--arm: 'ful' is not allowed; " in capsys.readouterr().err
-    assert rhmc(monkeypatch, "policy.pt", "--out", "b.gif", "--beside", "best_windows") == 2
+    assert run_rhmc("render", "policy.pt", "--out", "b.gif", "--beside", "best_windows") == 2
     said = capsys.readouterr().err
     assert said.startswith("--beside: 'best_windows' is not allowed; ")
     assert said.endswith("did you mean 'best_window'?\n")

@@ -6,14 +6,13 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from pipelines.cli import main as cli
 from pipelines.policies.evaluation import EvaluationEpisodes, Policy, score
 from pipelines.policies.transfer import TRANSFER, Size, export_transfer, sizes, transfer
 from pipelines.tracking.policy import Saved
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.work_folder import without_replay
 from tests.pipelines.policies.test_evaluation import of_kind, trained
-from tests.pipelines.support import jobs_of
+from tests.pipelines.support import jobs_of, run_rhmc
 
 
 def policy(encoder: str = "pairwise", kind: str = "iql") -> Policy:
@@ -78,12 +77,9 @@ def test_a_policy_that_cannot_act_with_them_is_said() -> None:
     ],
 )
 def test_bad_numbers_are_one_line(
-    words: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    words: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("sys.argv", ["rhmc", "transfer", "studies/coverage.yaml", "--out", str(tmp_path), *words])
-    with pytest.raises(SystemExit) as left:
-        cli.main()
-    assert left.value.code == 2
+    assert run_rhmc("transfer", "studies/coverage.yaml", "--out", str(tmp_path), *words) == 2
     assert capsys.readouterr().err == f"{said}\n"
     assert list(tmp_path.iterdir()) == []
 
@@ -95,10 +91,7 @@ def test_what_another_process_cannot_play_is_one_line(
     policies, seen = [policy(), policy("mlp")], jobs_of("pipelines.policies.transfer", monkeypatch)
     monkeypatch.setattr("pipelines.policies.evaluation.of_study", lambda *given: iter(policies))
     words = ["studies/coverage.yaml", "--agents", "3", "--episodes", "4", "--out", str(tmp_path), "--jobs", jobs]
-    monkeypatch.setattr("sys.argv", ["rhmc", "transfer", *words])
-    with pytest.raises(SystemExit) as left:
-        cli.main()
-    assert left.value.code == 2
+    assert run_rhmc("transfer", *words) == 2
     sizes = "--agents or --targets: iql with encoder 'mlp'"
     said = f"{sizes} acts only with the numbers that it was trained with; 'pairwise' acts with any\n"
     assert capfd.readouterr() == ("", said)

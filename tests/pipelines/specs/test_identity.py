@@ -21,7 +21,7 @@ from pipelines.specs.syntax import Code
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import ENVS
 from rhmc.training.trainer import Config as TrainerConfig
-from tests.blocks import fields, nested
+from tests.blocks import nested
 
 ROOT = Path(__file__).parents[3]
 PLACES = [(method, task) for method in ALGORITHMS for task in ENVS]
@@ -359,7 +359,7 @@ CONFIGS = [
     *(("algo", kind, config) for kind, config in TABLES["algo"].items()),
     ("trainer", "", TrainerConfig),
 ]
-FIELDS = [(section, kind, field) for section, kind, config in CONFIGS for field in fields(config) if field != "kind"]
+FIELDS = [(section, kind, field) for section, kind, config in CONFIGS for field in of_config(config) if field != "kind"]
 
 
 def other(field: FieldInfo) -> list[Any]:

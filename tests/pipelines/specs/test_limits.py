@@ -1,10 +1,11 @@
 """Findings of a check before a launch: numbers that are absurd, devices, what cannot go together, budgets too small."""
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
@@ -14,7 +15,7 @@ from pipelines.specs import limits
 from pipelines.specs.document import Node, Place, validate
 from pipelines.specs.learning_start import shortfall, starts
 from pipelines.specs.search import Dimension, Pruner, Sampler, Search
-from pipelines.specs.study import PROFILES, TABLES, Counts, Resources, SeedCounts, Setting, Study, StudyError
+from pipelines.specs.study import PROFILES, TABLES, Counts, Resources, RunSpec, SeedCounts, Setting, Study, StudyError
 from pipelines.workspace.errors import InputError
 from rhmc.algorithms import ALGORITHMS
 from rhmc.learning.learner import Learner
@@ -40,10 +41,17 @@ def node(value: Any, path: str = "") -> Node:
     return Node(value, HERE, HERE, path)
 
 
+def numeric(model: type[BaseModel]) -> Iterator[str]:
+    """The fields of a model that take a number."""
+    for name, field in model.model_fields.items():
+        if {int, float} & ({field.annotation} | set(get_args(field.annotation))):
+            yield name
+
+
 FIELDS = [
     pytest.param(model, name, id=f"{model.__module__}.{model.__name__}.{name}")
     for model in MODELS
-    for name in limits.numeric(model)
+    for name in numeric(model)
 ]
 
 
@@ -273,3 +281,64 @@ def test_the_check_names_the_arms_and_the_least_budget(file: Path) -> None:
         f"note: {file}:15:8: steps: 3,200 steps end before 'rhmc' learns; must be at least 4,064 (learning_starts "
         "4,000 + train_freq 64) (in arm 'c')",
     ]
+
+
+def test_the_words_say_how_many_updates_a_coordinator_waits_for() -> None:
+    def said(every: int) -> list[str]:
+        return [one.waits for one in starts(few("rhmc", "coverage", {"coordinator.update_every": every}))]
+
+    assert said(1) == ["learning_starts 25 + train_freq 7"]
+    assert said(2) == ["learning_starts 25 + train_freq 7", "learning_starts 25 + train_freq 7 x 2"]
+
+
+# Defaults and bounds of what is no method's
+
+
+def test_a_study_and_a_search_that_say_nothing() -> None:
+    assert Resources().model_dump() == {"concurrent": 2, "cpus": 1, "checkpoint_every": 20, "animate": "first"}
+    assert Sampler().model_dump() == {"kind": "tpe", "seed": 0, "startup": 10}
+    assert Pruner().model_dump() == {"kind": "none", "startup": 5, "warmup": 1, "reduction": 3}
+
+
+@pytest.mark.parametrize(
+    ("model", "name", "least", "most"),
+    [
+        *((Resources, name, 1, None) for name in ("concurrent", "cpus", "checkpoint_every")),
+        *((Sampler, "seed", 0, None), (Sampler, "startup", 1, None)),
+        *((Pruner, "startup", 1, None), (Pruner, "warmup", 1, None), (Pruner, "reduction", 2, None)),
+        *((Counts, profile, 1, 10**12) for profile in PROFILES),
+        *((SeedCounts, profile, 1, 1000) for profile in PROFILES),
+        (RunSpec, "seed", 0, 999_999),
+    ],
+)
+def test_numbers_on_either_side_of_their_bounds(
+    model: type[BaseModel], name: str, least: int, most: int | None
+) -> None:
+    rest = dict(setting()) if model is RunSpec else {}
+    for allowed in (least, *([most] if most else [])):
+        assert getattr(model.model_validate(rest | {name: allowed}), name) == allowed
+    for refused in (least - 1, *([most + 1] if most else [])):
+        with pytest.raises(ValidationError, match=name):
+            model.model_validate(rest | {name: refused})
+
+
+@pytest.mark.parametrize(
+    ("names", "most"),
+    [
+        ("agents targets", 100),
+        ("horizon seeds", 1000),
+        ("hidden_dim mixing_embed_dim", 8192),
+        ("threads concurrent cpus", 1024),
+        ("epochs minibatches actor_minibatches", 10_000),
+        ("episode assignment_period n_steps num_envs evaluations trials startup", 100_000),
+        ("batch_size checkpoint_every eval_episodes final_episodes", 1_000_000),
+        ("buffer_size", 100_000_000),
+        ("lr alpha unknown", 10**9),
+        ("steps epsilon_steps pretrain learning_starts eval_seed seed", 10**12),
+    ],
+)
+def test_the_largest_number_of_each_name(names: str, most: int) -> None:
+    for name in names.split():
+        assert (limits.beyond(name, most), limits.beyond(name, -most)) == ("", ""), name
+        assert limits.beyond(name, most + 1) == f"must be at most {most:,}", name
+        assert limits.beyond(name, -most - 1) == f"must be at least {-most:,}", name

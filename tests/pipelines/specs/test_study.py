@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipelines.specs.document import Node, Place, merge, plain
+from pipelines.specs.document import Node, Place, merge, plain, show
 from pipelines.specs.study import PROFILES, RunSpec, Study, StudyError, changes
 from rhmc.algorithms import ALGORITHMS
 from tests.support import changing
@@ -616,6 +616,23 @@ def test_whatever_is_written_into_a_study_is_read_or_refused(text: str, at: int,
     except StudyError as error:
         said = str(error)
     assert said is None or all(line.startswith("studies/x.yaml") for line in said.splitlines())
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        ("an arm", "'an arm'"),
+        ("a\x1b", r"'a\x1b'"),
+        (None, "null"),
+        (0.5, "0.5"),
+        ([1, {"lr": Node(True, Place(""), Place(""), "")}], '[1, {"lr": true}]'),
+        ({(1, 2): 3, "a": b""}, '{"a": "bytes"}'),
+        (b"x", "a bytes"),
+        ([1] * 99, f"[{'1, ' * 19}1…"),
+    ],
+)
+def test_any_value_can_be_shown(value: object, text: str) -> None:
+    assert show(value) == text
 
 
 # Merging

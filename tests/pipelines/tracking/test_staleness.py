@@ -5,9 +5,10 @@ from pathlib import Path
 from pipelines.specs.study import RunSpec
 from pipelines.tracking.mlflow_tracker import MlflowTracker
 from pipelines.tracking.plan import Item, items, resolved_yaml, study_card
-from pipelines.tracking.staleness import reasons
-from pipelines.tracking.tracker import MemoryTracker, Tracker
+from pipelines.tracking.staleness import stale_lines, stale_runs
+from pipelines.tracking.tracker import ADOPTED, FROM, Recorded, Tracker
 from pipelines.workspace.work_folder import Home
+from tests.memory_tracker import MemoryTracker
 from tests.pipelines.support import setting, tiny
 
 STUDY = tiny()
@@ -20,6 +21,10 @@ def log(tracker: Tracker, item: Item, modules: dict[str, str] | None = None) -> 
     run = tracker.start(card)
     run.text("config.yaml", resolved_yaml(item, CARD))
     run.finish("finished")
+
+
+def reasons(plan: list[Item], recorded: list[Recorded], tracker: Tracker) -> list[str]:
+    return stale_lines(stale_runs(plan, recorded, tracker))
 
 
 def changed(item: Item, **algo: object) -> Item:
@@ -77,6 +82,31 @@ def test_runs_of_one_reason_are_one_line_and_many_settings_are_cut() -> None:
     log(tracker, changed(items(study)[0], gamma=0.5, hidden_dim=17, batch_size=31, buffer_size=401))
     (line,) = reasons(items(study), tracker.recorded(), tracker)
     assert line.endswith("algo.hidden_dim was 17, now 16"), "all four are named"
+
+
+def test_a_run_whose_adopted_copy_is_in_the_log_is_not_stale() -> None:
+    slow, fast = items(STUDY)
+    tracker = MemoryTracker(CARD, [])
+    for item in (slow, fast._replace(card=fast.card._replace(spec_id="named0ther00")), changed(fast, gamma=0.5)):
+        log(tracker, item)
+    for item in (slow, fast):
+        copy = tracker.start(item.card)
+        copy.tag(ADOPTED, f"{FROM}0ldc0de00000: seed 0 trained again")
+        copy.finish("finished")
+    kept = "stale: arm 'fast', 1 run: other settings: algo.gamma was 0.5, now 0.99"
+    assert reasons(items(STUDY), tracker.recorded(), tracker) == [kept]
+    unlisted = "which kept no list of its modules"
+    other = slow.card._replace(fingerprint="0ther0000000", modules={})  # code of which nothing was adopted
+    tracker.start(other).finish("finished")
+    assert reasons(items(STUDY), tracker.recorded(), tracker) == [
+        kept,
+        f"stale: arm 'slow', 1 run: made by other code (0ther0000000), {unlisted}",
+    ]
+    (copy_of_fast,) = (run for run in tracker.shelf if run.card.key == fast.key)
+    tracker.drop(copy_of_fast.ref)
+    assert f"stale: arm 'fast', 1 run: made by other code (0ldc0de00000), {unlisted}" in reasons(
+        items(STUDY), tracker.recorded(), tracker
+    )
 
 
 def test_mlflow_keeps_the_list(home: Path) -> None:

@@ -15,10 +15,11 @@ from mlflow import MlflowClient
 from pipelines.specs.safe_names import shown
 from pipelines.tracking import histories, mlflow_tracker
 from pipelines.tracking.mlflow_tracker import MlflowTracker, open_existing
-from pipelines.tracking.tracker import Card, MemoryRun, MemoryTracker, Row, StudyCard, Tracker, points_of
+from pipelines.tracking.tracker import Card, Row, StudyCard, Tracker, points_of
 from pipelines.workspace.addresses import without_password
 from pipelines.workspace.provenance import Host
 from pipelines.workspace.work_folder import Home, StoreError
+from tests.memory_tracker import MemoryRun, MemoryTracker
 from tests.robustness.chaos import Server
 
 STUDY = StudyCard("demo", "quick", "**Why?**")

@@ -23,7 +23,6 @@ from optuna.storages import InMemoryStorage
 from rich.console import Console
 from ruamel.yaml import YAML
 
-from pipelines.cli import main as cli
 from pipelines.execution import ray_driver
 from pipelines.execution.finite import DivergedError
 from pipelines.execution.progress import PlainBoard
@@ -32,17 +31,18 @@ from pipelines.execution.trainable import ending
 from pipelines.specs.search import EVAL_SEED, FIRST_SEED, Dimension, Search
 from pipelines.specs.study import Setting, Study, StudyError
 from pipelines.tracking.mlflow_tracker import open_existing
-from pipelines.tracking.tracker import MemoryRun, MemoryTracker, points_of
+from pipelines.tracking.tracker import points_of
 from pipelines.tuning import ray_workers
 from pipelines.tuning.best_params import file_name, winner_yaml
 from pipelines.tuning.ray_workers import Failed
 from pipelines.tuning.search_plots import plots
 from pipelines.tuning.search_run import Drive, TrialLog, results, run_search, search_card, show_search
-from pipelines.tuning.trials import ATTEMPTS, ArmStudy, look, open_storage
+from pipelines.tuning.trials import ArmStudy, look, open_storage
 from pipelines.workspace.work_folder import Home, StoreError
 from rhmc.training.trainer import Trainer
+from tests.memory_tracker import MemoryRun, MemoryTracker
 from tests.pipelines.execution.test_trainable import same
-from tests.pipelines.support import CODE, interrupt, setting
+from tests.pipelines.support import CODE, Said, all_end, interrupt, run_rhmc, setting
 from tests.robustness.killed import PoolHere
 from tests.support import changing
 
@@ -101,7 +101,8 @@ def test_every_arm_has_the_same_budget_task_and_evaluation() -> None:
 
 def test_a_search_trains_and_evaluates_on_what_no_study_meets() -> None:
     search = load()
-    assert search.seed_list() == [FIRST_SEED, FIRST_SEED + 1]
+    assert search.seed_list() == [500_000, 500_001] == [FIRST_SEED, FIRST_SEED + 1]
+    assert EVAL_SEED == 20_000_000, "a search that goes on has met these episodes"
     assert {arm.setting.trainer.eval_seed for arm in search.arms.values()} == {EVAL_SEED}
     assert setting().trainer.eval_seed != EVAL_SEED
     told = load(changed("num_envs: 8", "num_envs: 8, eval_seed: 7"))
@@ -141,6 +142,16 @@ def test_what_the_space_replaces_is_no_part_of_a_searchs_identity() -> None:
     other = load(changed("algo: {kind: iql,", "algo: {kind: iql, lr: 9e-3,"))
     assert other.arms["IQL"].setting != first.arms["IQL"].setting
     assert other.identity("IQL") == first.identity("IQL")
+
+
+def test_what_the_space_replaces_in_a_block_is_no_part_of_it_either() -> None:
+    def identity(block: str) -> str:
+        arm = f"  RHMC: {{algo: {{kind: rhmc{block}}}, space: {{executor.gamma: {{low: 0.5, high: 0.9}}}}}}\n"
+        return load(changed("arms:\n", f"arms:\n{arm}")).identity("RHMC")
+
+    assert identity(", executor: {gamma: 0.7}") == identity("")
+    one = identity(", executor: {gamma: 0.7, epsilon: 0.1}")
+    assert one == identity(", executor: {epsilon: 0.1}") != identity(", executor: {epsilon: 0.2}")
 
 
 def test_the_digest_of_a_search_covers_what_it_includes() -> None:
@@ -478,6 +489,62 @@ def test_trials_that_fall_behind_are_given_up(tmp_path: Path, pruner: str) -> No
     assert set(states) == {("complete", "finished", True), ("pruned", "finished", False)}
 
 
+def test_a_pruned_trial_never_wins_and_of_equals_the_earliest_does(tmp_path: Path) -> None:
+    (iql, _) = World(load(), tmp_path).arm_studies()
+    first, second, third, fourth = (iql.ask() for _ in range(4))
+    assert first is not None
+    assert second is not None
+    assert third is not None
+    assert fourth is not None
+    iql.report(third, {"step": 200.0, "eval/return": 99.0}, 1)
+    iql.prune(third, "behind the others")
+    assert iql.best() is None
+    iql.complete(fourth, [3.0, 4.0])
+    iql.complete(second, [3.0, 5.0])
+    iql.complete(first, [4.0, 4.0])
+    best = iql.best()
+    assert best is not None
+    assert (best.trial_index, best.value, best.returns) == (0, 4.0, [4.0, 4.0])
+    assert (iql.closed, iql.left) == (4, 1)
+
+
+def test_the_earliest_of_equals_is_the_first_of_the_budget_whenever_it_was_tried(tmp_path: Path) -> None:
+    (iql, _) = World(load(), tmp_path).arm_studies()
+    died = iql.study.ask()  # before it had its values, while another was asked for
+    died.set_user_attr("trial_index", 0)
+    second = iql.ask()
+    iql.study.tell(died, state=optuna.trial.TrialState.FAIL)
+    first = iql.ask()
+    assert first is not None
+    assert second is not None
+    assert (first.trial_index, second.trial_index) == (0, 1)
+    for trial in (second, first):
+        iql.complete(trial, [4.0, 4.0])
+    best = iql.best()
+    assert best is not None
+    assert best.trial_index == 0
+
+
+@pytest.mark.parametrize(("warmup", "given_up_at"), [(1, 1), (2, 2), (3, 3)])
+def test_the_pruner_waits_for_its_points_and_trials(tmp_path: Path, warmup: int, given_up_at: int) -> None:
+    """Two good trials, of which the median is made, then one that is bad from the start."""
+    (iql, _) = World(load(GOOD + f"pruner: {{kind: median, startup: 2, warmup: {warmup}}}\n"), tmp_path).arm_studies()
+
+    def points(trial: Any, height: float) -> list[int]:
+        curve = [{"step": 200.0 * k, "eval/return": height} for k in range(1, 5)]
+        return [k for k, one in enumerate(curve, start=1) if iql.report(trial, one, k)]
+
+    for height in (9.0, 8.0):
+        trial = iql.ask()
+        assert trial is not None
+        assert points(trial, height) == [], "too few trials"
+        iql.complete(trial, [height])
+    bad = iql.ask()
+    assert bad is not None
+    assert points(bad, 1.0)[0] == given_up_at
+    assert iql.report(bad, {"step": 1000.0, "eval/return": 1.0, "final/return": 1.0}, 5) == "", "it is at its end"
+
+
 def test_no_finite_return_ends_a_trial_and_counts(tmp_path: Path) -> None:
     def wild(one: Setting, seed: int) -> list[float]:
         late = [0.0, 1.0, 2.0, math.nan] if one.algo.kind == "vdn" else [0.0, math.inf, 2.0, 3.0]
@@ -529,7 +596,7 @@ def test_a_trial_that_raises_is_tried_in_the_next_launches_and_then_left(tmp_pat
     assert sum(arm_study.closed for arm_study in world.arm_studies()) == 10 - failed
     run = next(run for run in world.shelf if run.status == "failed")
     assert (run.tags["error"], run.tags["state"]) == ("ValueError: no such rate", "failed")
-    assert [world.launch(raising).trained for _ in range(ATTEMPTS)] == [failed] * (ATTEMPTS - 1) + [0]
+    assert [world.launch(raising).trained for _ in range(3)] == [failed, failed, 0], "three launches try it"
     assert {arm_study.left for arm_study in world.arm_studies()} == {0}
 
 
@@ -732,6 +799,22 @@ def test_status_before_anything_ran_makes_nothing(tmp_path: Path, capsys: pytest
     assert not (tmp_path / "work").exists()
 
 
+def test_status_is_done_where_every_trial_is_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    world = World(load(), tmp_path)
+    world.launch()
+    monkeypatch.setattr("pipelines.tuning.search_run.opened", lambda place, write: nullcontext(world.storage))
+    best = world.arm_studies()[0].best()
+    assert best is not None
+    for trials, code, missing in ((5, 0, 0), (6, 1, 1), (3, 0, 0)):
+        assert show_search(load(GOOD, "quick", f"trials={trials}"), tmp_path) == code
+        out = capsys.readouterr().out
+        (row,) = (line.split() for line in out.splitlines() if line.split()[:2] == ["IQL", str(trials)])
+        assert row[2:] == ["5", "0", "0", "0", "0", str(missing), f"{best.value:.2f}", "0"]
+        assert f"IQL: final/return {best.value:.2f} over 2 seeds in trial {best.trial_index}: lr=" in out
+
+
 def test_trials_of_other_code_are_stale(tmp_path: Path) -> None:
     world = World(load(), tmp_path)
     world.launch()
@@ -745,7 +828,7 @@ def test_trials_of_other_code_are_stale(tmp_path: Path) -> None:
 
 # The command
 
-Rhmc = Callable[..., tuple[int, str, str]]
+Rhmc = Callable[..., Said]
 
 
 @pytest.fixture
@@ -754,12 +837,8 @@ def rhmc(project: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFi
     load()
     monkeypatch.setenv("RHMC_HOME", str(project / "work"))
 
-    def call(*words: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["rhmc", "search", *words])
-        with pytest.raises(SystemExit) as caught:
-            cli.main()
-        out, err = capfd.readouterr()
-        return int(caught.value.code or 0), out, err
+    def call(*words: str) -> Said:
+        return Said(run_rhmc("search", *words), *capfd.readouterr())
 
     return call
 
@@ -817,6 +896,7 @@ def test_a_killed_and_interrupted_search_ends_as_one_that_was_not(
     wait_for(work, lambda: bool(list(work.glob("checkpoints/*/0*.pt"))), process)
     process.kill()
     process.wait()
+    assert all_end(process.pid, "ray::")  # else one still saves a point, which `interrupt` takes for the launch below
     assert show_search(search, work) == 1
     threading.Thread(target=interrupt, args=(work,)).start()
     assert run_search(search, work, work / "out") == 130

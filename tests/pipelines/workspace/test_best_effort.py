@@ -16,12 +16,13 @@ from pipelines.execution.recorder import Recorder
 from pipelines.tracking import mlflow_tracker, overview
 from pipelines.tracking.overview import Run, so_far, table
 from pipelines.tracking.plan import study_card
-from pipelines.tracking.tracker import MemoryRun, MemoryTracker, StudyCard
+from pipelines.tracking.tracker import StudyCard
 from pipelines.tuning import search_run
 from pipelines.workspace.best_effort import WHY_NOT, decoration
 from pipelines.workspace.terminal import terminal
 from pipelines.workspace.work_folder import Home, StoreError
 from reports.data import escaping
+from tests.memory_tracker import MemoryRun, MemoryTracker
 from tests.pipelines.support import plan, setting, tiny
 from tests.reports.hostile import NAMES, QUESTION, csv_words, markdown_words
 

@@ -29,7 +29,7 @@ from pipelines.workspace import relocation, sqlite
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.work_folder import Home, StoreError, work_folder
 from rhmc.training.trainer import Trainer, grid_step
-from tests.pipelines.support import setting, tiny
+from tests.pipelines.support import fresh, setting, tiny
 
 HOSTILE = "#x ?y %2F z'\"~{a}\n"
 STUDY = tiny(arms={"one": setting(), "two": setting(lr=1e-2)})
@@ -70,9 +70,7 @@ def log(home: Path, arm: int) -> str:
 @pytest.fixture
 def old(tmp_path: Path, template: Path) -> Path:
     """A work folder with one finished run."""
-    folder = tmp_path / "old"
-    folder.mkdir()
-    shutil.copy(template, folder / "mlflow.db")
+    folder = fresh(tmp_path / "old", template)
     log(folder, 0)
     return folder
 
@@ -191,9 +189,7 @@ def test_a_policy_that_is_gone_is_named_with_its_place(old: Path, tmp_path: Path
 
 
 def test_runs_that_came_without_policies_travel_on_without_them(old: Path, tmp_path: Path, template: Path) -> None:
-    there = tmp_path / "there"
-    there.mkdir()
-    shutil.copy(template, there / "mlflow.db")
+    there = fresh(tmp_path / "there", template)
     pack(STUDY, tmp_path / "b", old, values_only=True)
     unpack(tmp_path / "b", there)
     assert pack(STUDY, tmp_path / "c", there).finished == 1

@@ -176,3 +176,15 @@ def test_the_encoder_is_compared_where_nothing_else_differs(tmp_path: Path) -> N
     assert np.isnan(rows.loc["d", "difference"])
     assert table.shown.set_index("Pairwise").loc["d", "Pairwise, final"] == "–"
     assert table.shown.set_index("Pairwise").loc["d", "Seeds"] == "0 of 3; 3"
+
+
+def test_two_arms_that_were_watched_are_told_apart(tmp_path: Path) -> None:
+    tables = study("reach", {"one": noisy(67), "two": noisy(63)}, points=4)
+    both = [assignments(tables[0], arm, [x] * 20, [0.0] * 20) for arm, x in (("one", 12.0), ("two", 6.0))]
+    results = of_folder(tmp_path, tables, name="reach.assignments.parquet", more=pd.concat(both))
+    drawing, table = beyond.fig_assignments(results, "reach"), beyond.table_assignments(results, "reach")
+    assert drawing is not None
+    assert table is not None
+    pairs = drawing.numbers[drawing.numbers["quantity"] == "pairs"]
+    assert pairs.groupby("arm")["mean"].unique().map(list).to_dict() == {"one": [12.0], "two": [6.0]}
+    assert table.numbers.set_index("arm")["pairs_first"].to_dict() == {"one": 12.0, "two": 6.0}

@@ -170,3 +170,47 @@ def test_one_arm_is_no_comparison(tmp_path: Path) -> None:
     assert comparison.pairs_table(found, "coverage") is None
     assert comparison.profile(found, "coverage") is None
     assert comparison.matrix(found, "coverage") is None
+
+
+@pytest.mark.parametrize(
+    ("p", "shown", "clear"),
+    [
+        (0.0009, "< 0.001", "yes"),
+        (0.001, "0.001", "yes"),
+        (0.0499, "0.050", "yes"),
+        (0.05, "0.050", "no"),
+        (float("nan"), NONE, NONE),
+    ],
+)
+def test_a_pair_is_clear_below_five_percent(
+    results: Results, monkeypatch: pytest.MonkeyPatch, p: float, shown: str, clear: str
+) -> None:
+    even = stats.Interval(0.5, 0.4, 0.6, 5)
+    monkeypatch.setattr(comparison, "pairs", lambda *given: [comparison.Pair("a", "b", even, even, p, p)])
+    table = comparison.pairs_table(results, "coverage")
+    assert table is not None
+    assert table.shown.loc[0, ["p", "p, Holm", "Clear"]].tolist() == [shown, shown, clear]
+
+
+@pytest.mark.parametrize(("seeds", "limit"), [(2, "0.33"), (3, "0.1"), (4, "")])
+def test_few_seeds_bound_what_ranks_can_show(tmp_path: Path, seeds: int, limit: str) -> None:
+    found = load(write(tmp_path, study("coverage", {"RHMC": noisy(70, seeds), "IQL": noisy(60, seeds)})), "quick")
+    table = comparison.pairs_table(found, "coverage")
+    assert table is not None
+    assert table.note.endswith(f" With {seeds} seeds a side no test by ranks can come below p = {limit}.") == bool(
+        limit
+    )
+
+
+@pytest.mark.parametrize(("arms", "drawn"), [(2, False), (3, True), (12, True), (13, False)])
+def test_a_matrix_is_of_three_to_twelve_arms(tmp_path: Path, arms: int, drawn: bool) -> None:
+    levels = {f"arm {n}": noisy(50 + n, 2) for n in range(arms)}
+    found = load(write(tmp_path, study("coverage", levels, points=2)), "quick")
+    assert (comparison.matrix(found, "coverage") is not None) == drawn
+
+
+@pytest.mark.parametrize(("mean", "level"), [(0.5, 0.45), (0.0, None)])
+def test_a_level_needs_a_return_above_zero(tmp_path: Path, mean: float, level: float | None) -> None:
+    found = load(write(tmp_path, study("navigation", {"RHMC": [mean, mean]}, env=NAVIGATION)), "quick")
+    reached = comparison.reference(found, "navigation")
+    assert (reached and reached.value) == (level and pytest.approx(level))

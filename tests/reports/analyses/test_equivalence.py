@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from scipy.stats import t
 
-from reports.analyses.equivalence import compare, differing, finals, read, summary, table
+from reports.analyses.equivalence import compare, compare_runs, differing, finals, read, summary, table
 from reports.data.frame import TableError
 from reports.data.stats import equivalence, equivalence_of_pairs
 from tests.reports import factory
@@ -33,7 +33,7 @@ def test_equal_results_are_byte_equal_whatever_their_order_and_whatever_else_is_
     here = tables(a=SEEDS, b=SEEDS, c=SEEDS).sample(frac=1, random_state=0)
     (one,) = compare(here, published)
     assert (one.outcome, one.holds, one.seeds, one.note) == ("byte-equal", True, 5, "")
-    assert summary([one], "quick") == "byte-equal to the published quick results: 1 arms"
+    assert summary([one], "quick") == "byte-equal to the published quick results: 1 arm"
 
 
 @pytest.mark.parametrize(
@@ -53,7 +53,7 @@ def test_a_shifted_arm(shift: float, expected: str, holds: bool) -> None:
     assert first.note.startswith("first difference: seed 0, step ")
     assert second.outcome == "byte-equal"
     assert [row[:3] for row in table([first, second])] == [["main", "a", "5"]]
-    assert f"1 arms {expected}" in summary([first, second], "quick")
+    assert f"1 arm {expected}" in summary([first, second], "quick")
 
 
 def test_the_last_bit_of_one_value_counts() -> None:
@@ -144,3 +144,40 @@ def test_folders_are_read_whole_or_not_at_all(tmp_path: Path) -> None:
     (tmp_path / "main.parquet").write_bytes(b"no table")
     with pytest.raises(TableError, match="not exported tables"):
         read(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("shift", "spread", "expected"),
+    [
+        (0.5, 0.115, "equivalent"),  # p = 0.05 at 0.5 / (sqrt 2 spread) = 2.92, that is, 0.121
+        (0.5, 0.127, UNSHOWN),
+        (0.98, 0.001, "equivalent"),
+        (1.02, 0.001, UNSHOWN),
+        (-1.02, 0.001, UNSHOWN),
+    ],
+)
+def test_arms_are_equivalent_within_one_point_at_five_percent(shift: float, spread: float, expected: str) -> None:
+    published = tables(a=[60 - spread, 60 + spread])
+    here = tables(a=[60 + shift - spread, 60 + shift + spread])
+    (one,) = compare(here, published)
+    assert one.outcome == expected
+    (same,) = compare(here, published, margin=5.0)
+    assert same.outcome == "equivalent"
+
+
+@pytest.mark.parametrize(
+    ("shift", "spread", "expected"),
+    [
+        (0.5, 0.075, "equivalent"),  # p = 0.05 at 0.5 / spread = 6.31, that is, 0.0792
+        (0.5, 0.083, UNSHOWN),
+        (0.98, 0.001, "equivalent"),
+        (1.02, 0.001, UNSHOWN),
+        (-1.02, 0.001, UNSHOWN),
+    ],
+)
+def test_runs_are_equivalent_within_one_point_at_five_percent(shift: float, spread: float, expected: str) -> None:
+    published = tables(a=[60.0, 61.0, 59.0])
+    here = tables(a=[60 + shift - spread, 61 + shift + spread, 59.0])
+    found = compare_runs(here, published)
+    assert [(one.outcome, one.seeds) for one in found] == [(expected, 1), (expected, 1), ("byte-equal", 1)]
+    assert compare_runs(here, published, margin=5.0)[0].outcome == "equivalent"

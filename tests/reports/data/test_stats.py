@@ -143,3 +143,20 @@ def test_a_curve_has_the_interval_of_every_point() -> None:
     for row in stats.curve(points).itertuples():
         own = stats.interval(points[points["step"] == row.step]["value"].to_numpy())
         assert (row.mean, row.low, row.high, row.n) == pytest.approx(tuple(own))
+
+
+def test_the_resamples_are_those_of_the_published_reports() -> None:
+    assert stats.interval(drawn(5)) == pytest.approx((60.16262300178984, 58.180174115251404, 62.14993665829322, 5))
+    found = stats.difference(drawn(5), drawn(6, 1))
+    assert found == pytest.approx((-0.8681854109982297, -4.249533404232246, 3.887641473663647, 5), abs=1e-9)
+
+
+def test_fewer_than_five_seeds_are_few() -> None:
+    assert [stats.interval(drawn(n)).few for n in (2, 4, 5, 6)] == [True, True, False, False]
+
+
+def test_the_ends_of_an_interval_belong_to_it() -> None:
+    found = stats.Interval(2.0, 1.0, 3.0, 5)
+    assert [found.holds(x) for x in (0.9, 1.0, 3.0, 3.1)] == [False, True, True, False]
+    assert [found.above(x) for x in (0.9, 1.0)] == [True, False]
+    assert [found.below(x) for x in (3.0, 3.1)] == [False, True]

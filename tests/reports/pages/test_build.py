@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +16,19 @@ from matplotlib.text import Text
 from reports.data.frame import TableError, load
 from reports.data.paper import read
 from reports.pages import build as report
-from reports.pages.build import build, main
+from reports.pages.build import build, write_report
 from reports.render import figures, tables
-from tests.reports.factory import NAVIGATION, YARDSTICK_RETURNS, methods, noisy, study, theorem, write, yardsticks
+from tests.reports.factory import (
+    NAVIGATION,
+    YARDSTICK_RETURNS,
+    methods,
+    noisy,
+    reporting,
+    study,
+    theorem,
+    write,
+    yardsticks,
+)
 
 ROOT = Path(__file__).parents[3]
 
@@ -80,7 +89,7 @@ def test_the_same_bytes_in_another_process_with_other_settings(runs: Path, made:
     (tmp_path / "matplotlibrc").write_text("font.size: 20\nsavefig.dpi: 50\npdf.compression: 1\n")
     out = tmp_path / "report"
     env = os.environ | {"PYTHONHASHSEED": "7", "MATPLOTLIBRC": str(tmp_path), "TZ": "Asia/Tokyo"}
-    call = [sys.executable, "-m", "reports.pages.build", "--runs", str(runs), "--out", str(out)]
+    call = reporting(runs, out)
     said = subprocess.run(call, cwd=ROOT, env=env, check=True, capture_output=True, text=True).stdout
     assert said == f"{len(content(out))} files; start with {out / 'index.html'}\n"
     first, second = content(made), content(out)
@@ -291,10 +300,10 @@ def test_faulty_tables_leave_the_old_report(few: Path, tmp_path: Path, capsys: p
     out = tmp_path / "out"
     assert len(build(few, out, "quick").files) == len(content(out))
     before = content(out)
-    assert main(["--profile", "paper", "--runs", str(few), "--out", str(out)]) == 2
+    assert write_report(few, out, "paper") == 2
     lines = capsys.readouterr().err.splitlines()
     assert "made with profile 'quick', and this report is of 'paper'" in lines[0]
-    assert main(["--runs", str(tmp_path / "no"), "--out", str(out)]) == 2
+    assert write_report(tmp_path / "no", out) == 2
     assert content(out) == before
 
 
@@ -342,13 +351,13 @@ def test_a_study_that_the_paper_does_not_have_gets_its_curves(runs: Path, tmp_pa
 def test_tables_of_an_older_version_are_set_aside_and_the_page_says_so(
     runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    folder, arguments = tmp_path / "runs", ["--runs", str(tmp_path / "runs"), "--out", str(tmp_path / "out")]
+    folder = tmp_path / "runs"
     shutil.copytree(runs, folder)
     said = "made by an older version and set aside, until `rhmc study run` and `rhmc export` make them anew"
-    assert report.main(arguments) == 0
+    assert write_report(folder, tmp_path / "out") == 0
     assert said not in capsys.readouterr().err + (tmp_path / "out" / "index.md").read_text()
     pd.read_parquet(folder / "coverage.runs.parquet").to_parquet(folder / "coverage.runs.parquet")
-    assert report.main(arguments) == 0
+    assert write_report(folder, tmp_path / "out") == 0
     assert capsys.readouterr().err == f"note: Tables of coverage: {said}.\n"
     assert f"**Tables of coverage: {said}.**" in (tmp_path / "out" / "index.md").read_text()
     assert f"Tables of coverage: {said.replace('`', '')}." in (tmp_path / "out" / "index.html").read_text()

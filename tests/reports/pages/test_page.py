@@ -11,7 +11,7 @@ import pytest
 
 from reports.data.frame import TableError
 from reports.pages import page
-from reports.pages.build import build, main
+from reports.pages.build import build, write_report
 from tests.reports.factory import noisy, study, write, yardsticks
 
 pytestmark = pytest.mark.usefixtures("quick_resampling")
@@ -157,7 +157,7 @@ def test_one_study(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arms = {"one": noisy(67), "two": noisy(63), "three": noisy(50)}
     runs = write(tmp_path / "runs", study("reach", arms, points=4), study("other", {"x": noisy(1)}), yardsticks())
     out = tmp_path / "out"
-    assert main(["--study", "reach", "--runs", str(runs), "--out", str(out)]) == 0
+    assert write_report(runs, out, study="reach") == 0
     assert f"start with {out / 'index.html'}" in capsys.readouterr().out
     names = {str(path.relative_to(out)) for path in out.rglob("*") if path.is_file()}
     assert {"index.html", "index.md", "figures/curves_reach.pdf", "tables/pairs_reach.tex"} <= names
@@ -166,7 +166,7 @@ def test_one_study(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "Study reach, profile quick" in text
     assert "Pairs of arms, study reach" in text
     assert "The paper's claims" not in text
-    assert main(["--study", "raech", "--runs", str(runs), "--out", str(out)]) == 2
+    assert write_report(runs, out, study="raech") == 2
     assert "no table of study 'raech' here (there are other, reach)" in capsys.readouterr().err
 
 
@@ -207,3 +207,22 @@ def test_words_are_escaped_and_breaks_kept() -> None:
 @pytest.mark.parametrize(("seconds", "words"), [(0, "0 s"), (89, "89 s"), (95, "2 min"), (11_530, "3 h 12 min")])
 def test_durations(seconds: float, words: str) -> None:
     assert page.duration(seconds) == words
+
+
+GIF = bytes.fromhex("47494638396102000100800000ffffff00000021f90400000000002c00000000020001000002020c0a003b")
+
+
+@pytest.mark.parametrize(
+    ("gif", "whole"),
+    [
+        (GIF, True),
+        (b"GIF87a" + GIF[6:], True),
+        (b"GIF88a" + GIF[6:], False),
+        (GIF[:-1], False),
+        (GIF[:6] + bytes(2) + GIF[8:], False),
+        (GIF[:8] + bytes(2) + GIF[10:], False),
+        (b"", False),
+    ],
+)
+def test_what_is_a_whole_animation(gif: bytes, whole: bool) -> None:
+    assert page.animation_fault(gif) == ("" if whole else f"the file is not a whole GIF ({len(gif)} bytes)")

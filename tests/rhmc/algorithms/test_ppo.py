@@ -198,6 +198,17 @@ def test_targets_and_advantages_by_hand(
     assert torch.allclose(advantage, torch.tensor([[-1.0], [1.0]]).expand(2, N), atol=1e-4)
 
 
+def test_a_critic_that_says_the_same_everywhere_explains_nothing() -> None:
+    """Advantages 0.25 and 1 beside targets 2.25 and 3: all of the targets' spread is left."""
+    algo = method(gamma=0.5, gae_lambda=0.5, standardise="none")
+    constant(algo.critic.net, [2.0])
+    algo.observe(acted(algo, torch.tensor([1.0])))
+    algo.observe(acted(algo, torch.tensor([3.0]), terminated=torch.tensor([True])))
+    logs = algo.update()
+    assert float(logs["value"]) == 2.0
+    assert float(logs["explained"]) == pytest.approx(0.0, abs=1e-5)
+
+
 def test_rewards_are_standardised_before_the_returns(monkeypatch: pytest.MonkeyPatch) -> None:
     """Mean 2 and deviation 1; value 0.5 everywhere, gamma 0.5."""
     algo = method(gamma=0.5, standardise="reward", n_steps=1)

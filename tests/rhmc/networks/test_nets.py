@@ -13,6 +13,7 @@ from rhmc.envs import coverage, make_env, navigation
 from rhmc.networks.linear import Linear
 from rhmc.networks.nets import ENCODERS, Sizes, append, mlp
 from rhmc.types import Obs
+from tests.support import reordered
 
 HIDDEN, OUT = 8, 3
 Make = Callable[[Sizes], nn.Module]
@@ -34,10 +35,6 @@ def draw(s: Sizes, batch: int = 2) -> Obs:
     first = torch.zeros(batch, dtype=torch.bool)
     peers = torch.randn(batch, s.agents, s.agents, s.peer)
     return Obs(torch.randn(batch, s.agents, s.agent), torch.randn(batch, s.agents, s.targets, s.pair), peers, first)
-
-
-def reorder_agents(obs: Obs, order: list[int]) -> Obs:
-    return Obs(obs.agents[:, order], obs.pairs[:, order], obs.peers[:, order][:, :, order], obs.first)
 
 
 def reorder_targets(obs: Obs, order: list[int]) -> Obs:
@@ -94,7 +91,7 @@ def test_pairwise_follows_a_reordering_of_agents_and_of_targets(shape: str, task
     net, obs = SHAPES[shape](s), draw(s)
     out = net(obs)
     agents, targets = torch.randperm(s.agents).tolist(), torch.randperm(s.targets).tolist()
-    assert close(net(reorder_agents(obs, agents)), out[:, agents])
+    assert close(net(reordered(obs, agents)), out[:, agents])
     expected = out[:, :, targets] if shape.endswith("pairs") else out
     assert close(net(reorder_targets(obs, targets)), expected)
 
@@ -155,7 +152,7 @@ def test_pairwise_central_reorders_actions_with_agents() -> None:
     s = TASKS["all"]
     net, obs = ENCODERS["pairwise"].central(s, HIDDEN, OUT, own=2, joint=4), draw(s)
     own, joint, order = torch.randn(2, 3, 2), torch.randn(2, 3, 4), [2, 0, 1]
-    out = net(reorder_agents(obs, order), own[:, order], joint[:, order])
+    out = net(reordered(obs, order), own[:, order], joint[:, order])
     assert close(out, net(obs, own, joint)[:, order])
 
 
