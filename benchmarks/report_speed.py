@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from pipelines.export.tables import RUNS as EXPORTED
 from pipelines.export.tables import write_parquet
 from reports.data.frame import OWN, PLACE, POINTS, RUNS
+from reports.data.schema import RUNS as EXPORTED
 from reports.pages.build import build
 
 STUDIES = ("ablation", "coverage", "reach", "scaling")

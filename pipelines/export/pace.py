@@ -5,10 +5,11 @@ from contextlib import suppress
 from pathlib import Path
 from statistics import median
 
-from pipelines.export.tables import MADE, RUNS, read_parquet
+from pipelines.export.tables import read_parquet
 from pipelines.specs.study import Study
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.work_folder import StoreError
+from reports.data.schema import MADE, RUNS
 
 
 def estimated(study: Study, folder: Path) -> str:

@@ -13,18 +13,18 @@ from typing import Any, NamedTuple
 import pandas as pd
 import pyarrow as pa
 
-from pipelines.export.tables import METRICS, VERSION, write_parquet, write_tables
+from pipelines.export.tables import write_parquet, write_tables
 from pipelines.specs.study import RunSpec, Study
 from pipelines.tracking.plan import items, study_card
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.process_pool import side_by_side
 from pipelines.workspace.work_folder import Home, one_line
+from reports.data.schema import METRICS, PLACE, VERSION
 from rhmc.training.trainer import Trainer
 
 RESULTS = Path("results")
 NAME = "results"  # of the tables of a profile in small form
 CURVE, FINALS = "eval/return", "final/"
-PLACE = [field for field in METRICS if field.name in {"study", "arm", "seed", "run"}]
 RUNS = pa.schema([*PLACE, pa.field("profile", pa.string())], metadata=VERSION)
 CONFIG = pa.field("config", pa.string())  # the spec as canonical JSON
 

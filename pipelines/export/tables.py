@@ -19,45 +19,7 @@ from pipelines.tracking.tracker import Recorded, Row, Tracker
 from pipelines.workspace.errors import InputError, visible
 from pipelines.workspace.files import regular
 from pipelines.workspace.work_folder import Home, StoreError, lacks_memory, reason, whole, work_folder
-
-PLACE = [("study", pa.string()), ("arm", pa.string()), ("seed", pa.int64()), ("run", pa.string())]  # run: spec id
-METRICS = pa.schema([*PLACE, ("step", pa.int64()), ("metric", pa.string()), ("value", pa.float64())])
-VERSION = {"rhmc.tables": "2"}  # of the names in the tables of runs; the report sets tables of an older one aside
-RUNS = pa.schema(  # the planned runs: nothing here depends on commit, machine or time
-    [
-        *PLACE,
-        ("status", pa.string()),  # finished, failed, partial or missing
-        ("algorithm", pa.string()),
-        ("task", pa.string()),
-        ("profile", pa.string()),
-        ("config", pa.string()),  # the spec as canonical JSON
-        ("fingerprint", pa.string()),  # code id
-        ("question", pa.string()),
-    ],
-    metadata=VERSION,
-)
-MADE = pa.schema(  # the runs that are there: how and where each was made
-    [
-        *PLACE,
-        ("commit", pa.string()),
-        ("seconds", pa.float64()),  # spent training
-        ("machine", pa.string()),
-        ("versions", pa.string()),
-        ("adopted", pa.string()),  # from which code, where older code made it
-    ]
-)
-READINGS = pa.schema(  # the level of each factor, of every arm of a study with readings
-    [
-        ("study", pa.string()),
-        ("arm", pa.string()),
-        ("contrast", pa.string()),  # the arm as the study's file has it
-        ("reading", pa.string()),
-        ("factor", pa.string()),
-        ("place", pa.int64()),  # of the factor among the factors, from 0
-        ("level", pa.string()),
-        ("number", pa.int64()),  # of the level in its factor, from 0
-    ]
-)
+from reports.data.schema import MADE, METRICS, READINGS, RUNS
 
 
 def export_study(study: Study, out: Path, home: Path | None = None) -> int:

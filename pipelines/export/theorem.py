@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from pipelines.export.tables import METRICS, write_parquet
+from pipelines.export.tables import write_parquet
+from reports.data.schema import METRICS
 from rhmc.hierarchy.theorem import Shortfall
 
 STUDY = "theorem"

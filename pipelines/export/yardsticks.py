@@ -8,11 +8,12 @@ from typing import Any, NamedTuple
 
 import pyarrow as pa
 
-from pipelines.export.tables import MADE, METRICS, RUNS, read_parquet, write_parquet
+from pipelines.export.tables import read_parquet, write_parquet
 from pipelines.specs.identity import fingerprint
 from pipelines.tracking.plan import commit
 from pipelines.workspace.process_pool import side_by_side
 from pipelines.workspace.provenance import host
+from reports.data.schema import MADE, METRICS, RUNS
 from rhmc.envs import EnvConfig
 from rhmc.envs.coverage import Config as Coverage
 from rhmc.envs.navigation import Config as Navigation

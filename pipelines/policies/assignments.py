@@ -11,11 +11,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pipelines.export.tables import METRICS, read_parquet, write_parquet
+from pipelines.export.tables import read_parquet, write_parquet
 from pipelines.specs.study import Study
 from pipelines.tracking.plan import Item, chosen, items
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.process_pool import side_by_side
+from reports.data.schema import METRICS
 from rhmc.hierarchy.regulation import exact, paper
 from rhmc.training.trainer import Trainer
 from rhmc.types import Metrics, Transition

@@ -5,32 +5,15 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-import pyarrow as pa
-
 from pipelines.export.tables import write_parquet
 from pipelines.policies.evaluation import EvaluationEpisodes, Policy, score
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.process_pool import side_by_side
 from pipelines.workspace.work_folder import without_replay
+from reports.data.schema import TRANSFER
 from rhmc.envs import coverage
 
 FILE = "transfer.parquet"
-TRANSFER = pa.schema(
-    [
-        ("study", pa.string()),  # that trained the policy
-        ("arm", pa.string()),
-        ("seed", pa.int64()),
-        ("run", pa.string()),  # spec id
-        ("task", pa.string()),  # kind and preset
-        ("agents", pa.int64()),
-        ("targets", pa.int64()),
-        ("trained_agents", pa.int64()),
-        ("trained_targets", pa.int64()),
-        ("episodes", pa.int64()),
-        ("value", pa.float64()),  # mean return
-        ("sem", pa.float64()),  # its standard error over episodes
-    ]
-)
 
 Row = tuple[object, ...]
 

@@ -15,40 +15,29 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from reports.data import schema
 from reports.data.drawn import content, told
 
-PLACE = ("study", "arm", "seed", "run")
-POINTS = (*PLACE, "step", "metric", "value")
-RUNS = (*PLACE, "status", "algorithm", "task", "profile", "config", "fingerprint", "question")
-TOLD = ("machine", "versions", "adopted")
-OWN = ("commit", "seconds", *TOLD)  # how and where a run was made
 MADE = "made"  # `<study>.made.parquet`, which may be missing
 MOVED = "transfer"  # the table of trained policies with other numbers of agents and targets
-PLAYED = ("study", "arm", "seed", "run", "task", "agents", "targets", "trained_agents", "trained_targets", "value")
 ASSIGNED = "assignments"  # `<study>.assignments.parquet`: what the runs of a study assigned while they trained
 READINGS = "readings"  # `<study>.readings.parquet`: the level of each factor, of every arm of a study with readings
-LEVELS = ("study", "arm", "contrast", "reading", "factor", "place", "level", "number")
-FORMS: Mapping[str, tuple[str, ...]] = {
-    "points": POINTS,
-    "runs": RUNS,
-    MADE: (*PLACE, *OWN),
-    ASSIGNED: POINTS,
-    MOVED: PLAYED,
-    READINGS: LEVELS,
+FORMS: Mapping[str, pa.Schema] = {
+    "points": schema.METRICS,
+    "runs": schema.RUNS,
+    MADE: schema.MADE,
+    ASSIGNED: schema.METRICS,
+    MOVED: schema.TRANSFER,
+    READINGS: schema.READINGS,
 }
+PLACE, POINTS, RUNS = schema.PLACE.names, schema.METRICS.names, schema.RUNS.names
+PLAYED, LEVELS = schema.TRANSFER.names, schema.READINGS.names
+OWN = [name for name in schema.MADE.names if name not in PLACE]  # how and where a run was made
+TOLD = [name for name in OWN if name not in ("commit", "seconds")]
 
-VERSION = (b"rhmc.tables", b"2")  # in the metadata of a table of runs
-WHOLE = (
-    "seed",
-    "step",
-    "agents",
-    "targets",
-    "trained_agents",
-    "trained_targets",
-    "place",
-    "number",
-)  # columns of integers from 0
-NUMBERS = ("value", "seconds")  # columns of numbers; an empty cell is NaN. All others hold words
+TYPES = {field.name: field.type for form in FORMS.values() for field in form}
+WHOLE = {name for name, kind in TYPES.items() if kind == schema.WHOLE}  # integers from 0
+NUMBERS = {name for name, kind in TYPES.items() if kind == schema.NUMBER}  # an empty cell is NaN. All others hold words
 UNKNOWN = ("fingerprint", "question", "commit", *TOLD)  # words that may not be known
 STUDY = re.compile(r"[\w-]+(@[\w-]+)?")  # a study's name, and of a variant
 
@@ -73,9 +62,14 @@ def earlier(path: Path) -> bool:
 def older(path: Path) -> bool:
     """True if a table of runs was exported by an older version, with that version's names of studies and settings."""
     try:
-        return part(path) == "runs" and VERSION not in (_schema(path).metadata or {}).items()
+        return part(path) == "runs" and not _of_now(_schema(path))
     except (OSError, ValueError, pa.ArrowException):
         return False  # `read` says what is wrong with it
+
+
+def _of_now(found: pa.Schema) -> bool:
+    wanted = schema.RUNS.metadata
+    return {key: (found.metadata or {}).get(key) for key in wanted} == wanted
 
 
 def _schema(path: Path) -> pa.Schema:
@@ -84,7 +78,7 @@ def _schema(path: Path) -> pa.Schema:
 
 def read(path: Path, faults: list[str]) -> pd.DataFrame:
     """The columns of a file's form; what is wrong goes to `faults`, a line each."""
-    form = FORMS[part(path)]
+    form = FORMS[part(path)].names
     try:
         table = pq.ParquetFile(pa.BufferReader(content(path))).read()
     except MemoryError:

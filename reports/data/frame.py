@@ -99,8 +99,8 @@ class Results:
     methods: Sequence[Mapping[str, Any]] = ()
     modules: Sequence[Build] = ()
     scenes: Scenes | None = None
-    moved: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=list(PLAYED)))
-    levels: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=list(LEVELS)))
+    moved: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=PLAYED))
+    levels: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=LEVELS))
     notes: tuple[str, ...] = ()
     older: tuple[str, ...] = ()
     episodes: Mapping[str, bytes] = field(default_factory=dict)
@@ -307,7 +307,7 @@ def load(folder: Path, profile: str, only: str | None = None) -> Results:
             faults.append(f"{name}.parquet: {name.removesuffix('.runs')}.parquet (the points) is not beside it")
     drawn = (read_methods(folder, faults), read_modules(folder, faults), read_scenes(folder, faults))
     if not faults:
-        joined = {kind: _join(found, FORMS[kind]) for kind, found in tables.items()}
+        joined = {kind: _join(found, FORMS[kind].names) for kind, found in tables.items()}
         watched, moved, notes = _of_plan(joined)
         points = _join([joined["points"], watched], POINTS)
         gifs = {path.stem.partition("_")[2]: _animation(path) for path in sorted(folder.glob(EPISODES))}
@@ -377,13 +377,13 @@ def _join(tables: list[pd.DataFrame], columns: Sequence[str]) -> pd.DataFrame:
 
 def _with_made(runs: pd.DataFrame, made: pd.DataFrame) -> pd.DataFrame:
     """The planned runs, and of each how it was made, as far as that is known."""
-    once = made.drop_duplicates(list(PLACE)).astype({"seed": "int64", "seconds": "float64"})
-    both = runs.astype({"seed": "int64"}).merge(once, how="left", on=list(PLACE))
+    once = made.drop_duplicates(PLACE).astype({"seed": "int64", "seconds": "float64"})
+    both = runs.astype({"seed": "int64"}).merge(once, how="left", on=PLACE)
     return both.fillna(dict.fromkeys([name for name in OWN if name != "seconds"], ""))
 
 
 def _made_faults(made: pd.DataFrame) -> Iterator[str]:
-    for row in made[made.duplicated(list(PLACE))].itertuples():
+    for row in made[made.duplicated(PLACE)].itertuples():
         yield f"{_name(row)}, run {row.run}: how it was made stands there twice"
 
 

@@ -231,9 +231,9 @@ def provenance(results: Results) -> Table:
 
 def made(results: Results) -> Table:
     """The machine and code that made every planned run."""
-    rows = results.runs.sort_values(list(PLACE), kind="stable")
+    rows = results.runs.sort_values(PLACE, kind="stable")
     numbers = rows[[*PLACE, *OWN]].reset_index(drop=True)
-    shown = numbers[list(PLACE)].assign(
+    shown = numbers[PLACE].assign(
         commit=[_short(commit) or NONE for commit in numbers["commit"]],
         processor_time=[NONE if np.isnan(x) else f"{number(x / 60)} min" for x in numbers["seconds"]],
     )
@@ -249,9 +249,9 @@ def _short(commit: str) -> str:
 
 def runs(results: Results) -> Table:
     """Every planned run, with its status and its final return."""
-    numbers = results.runs.sort_values(list(PLACE), kind="stable")
+    numbers = results.runs.sort_values(PLACE, kind="stable")
     finals = results.points[results.points["metric"] == FINAL][[*PLACE, "value"]]
-    numbers = numbers.merge(finals, how="left", on=list(PLACE))
+    numbers = numbers.merge(finals, how="left", on=PLACE)
     numbers = numbers[[*PLACE, "status", "value", "fingerprint"]]
     numbers = numbers.rename(columns={"value": "final_return"}).reset_index(drop=True)
     shown = numbers.assign(final_return=[number(x) for x in numbers["final_return"]])

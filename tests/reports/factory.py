@@ -12,8 +12,8 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipelines.export.tables import RUNS as RUNS_OF_NOW
 from reports.data.frame import METHOD, METHODS, OWN, PLACE, POINTS, RUNS
+from reports.data.schema import RUNS as RUNS_OF_NOW
 
 COVERAGE = {"kind": "coverage", "preset": "flat", "agents": 4, "targets": 5, "observation": "extended"}
 NAVIGATION = {"kind": "navigation", "agents": 3, "reward": "paper"}

@@ -12,11 +12,12 @@ from typer.testing import CliRunner
 
 from pipelines.cli.main import app
 from pipelines.export.published import Again, folder, publish, retrain
-from pipelines.export.tables import VERSION, write_tables
+from pipelines.export.tables import write_tables
 from pipelines.specs.study import Study
 from pipelines.tracking.plan import items, study_card
 from pipelines.workspace.errors import InputError
 from reports.analyses.equivalence import read
+from reports.data.schema import VERSION
 from rhmc.training.trainer import Trainer
 from tests.memory_tracker import MemoryTracker
 from tests.pipelines.support import setting, tiny

@@ -9,14 +9,14 @@ import pytest
 import torch
 
 from pipelines.export.pace import estimated, paces
-from pipelines.export.tables import MADE, METRICS, READINGS, RUNS, export_study, write_tables
+from pipelines.export.tables import export_study, write_tables
 from pipelines.specs.readings import Cell, Plan
 from pipelines.specs.study import RunSpec, Study
 from pipelines.tracking.plan import Item, items, study_card
 from pipelines.workspace.provenance import Host, host
 from pipelines.workspace.work_folder import StoreError
-from reports.data.exported import FORMS
 from reports.data.frame import TableError, load
+from reports.data.schema import MADE, METRICS, RUNS
 from tests.memory_tracker import MemoryRun, MemoryTracker
 from tests.pipelines.support import CODE, plan, tiny
 
@@ -125,11 +125,6 @@ def test_the_same_log_gives_the_same_bytes(shelf: list[MemoryRun], tmp_path: Pat
     folders = ("a", "a/again", "b", "b/again")
     assert all(len({(tmp_path / folder / name).read_bytes() for folder in folders}) == 1 for name in names)
     assert sorted(path.name for path in (tmp_path / "b").iterdir() if path.is_file()) == sorted(names)
-
-
-def test_the_reports_read_what_is_exported() -> None:
-    forms = {"points": METRICS, "runs": RUNS, "made": MADE, "readings": READINGS}
-    assert {name: FORMS[name] for name in forms} == {name: tuple(schema.names) for name, schema in forms.items()}
 
 
 def read_study() -> Study:

@@ -7,10 +7,11 @@ import pandas as pd
 import pytest
 
 from pipelines.policies.evaluation import EvaluationEpisodes, Policy, score
-from pipelines.policies.transfer import TRANSFER, Size, export_transfer, sizes, transfer
+from pipelines.policies.transfer import Size, export_transfer, sizes, transfer
 from pipelines.tracking.policy import Saved
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.work_folder import without_replay
+from reports.data.schema import TRANSFER
 from tests.pipelines.policies.test_evaluation import of_kind, trained
 from tests.pipelines.support import jobs_of, run_rhmc
 

@@ -1,0 +1,57 @@
+"""The columns of the exported tables and their types: the exporter writes by them, the reports check by them."""
+
+import pyarrow as pa
+
+WORDS, WHOLE, NUMBER = pa.string(), pa.int64(), pa.float64()
+VERSION = {"rhmc.tables": "2"}  # of the names in the tables of runs; the report sets tables of an older one aside
+
+PLACE = pa.schema([("study", WORDS), ("arm", WORDS), ("seed", WHOLE), ("run", WORDS)])  # run: spec id
+METRICS = pa.schema([*PLACE, ("step", WHOLE), ("metric", WORDS), ("value", NUMBER)])
+RUNS = pa.schema(  # the planned runs: nothing here depends on commit, machine or time
+    [
+        *PLACE,
+        ("status", WORDS),  # finished, failed, partial or missing
+        ("algorithm", WORDS),
+        ("task", WORDS),
+        ("profile", WORDS),
+        ("config", WORDS),  # the spec as canonical JSON
+        ("fingerprint", WORDS),  # code id
+        ("question", WORDS),
+    ],
+    metadata=VERSION,
+)
+MADE = pa.schema(  # the runs that are there: how and where each was made
+    [
+        *PLACE,
+        ("commit", WORDS),
+        ("seconds", NUMBER),  # spent training
+        ("machine", WORDS),
+        ("versions", WORDS),
+        ("adopted", WORDS),  # from which code, where older code made it
+    ]
+)
+READINGS = pa.schema(  # the level of each factor, of every arm of a study with readings
+    [
+        ("study", WORDS),
+        ("arm", WORDS),
+        ("contrast", WORDS),  # the arm as the study's file has it
+        ("reading", WORDS),
+        ("factor", WORDS),
+        ("place", WHOLE),  # of the factor among the factors, from 0
+        ("level", WORDS),
+        ("number", WHOLE),  # of the level in its factor, from 0
+    ]
+)
+TRANSFER = pa.schema(  # trained policies with other numbers of agents and targets
+    [
+        *PLACE,
+        ("task", WORDS),  # kind and preset
+        ("agents", WHOLE),
+        ("targets", WHOLE),
+        ("trained_agents", WHOLE),
+        ("trained_targets", WHOLE),
+        ("episodes", WHOLE),
+        ("value", NUMBER),  # mean return
+        ("sem", NUMBER),  # its standard error over episodes
+    ]
+)
