@@ -2,6 +2,7 @@
 
 import shlex
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -123,6 +124,8 @@ def list_(
     folder: Annotated[Path, typer.Option(help="Where the studies are.")] = Path("studies"), as_json: Json = False
 ) -> None:
     """List the studies of a folder with their questions and variants."""
+    with suppress(FileNotFoundError):
+        folder.stat()  # a name that cannot be looked at: from Python 3.13 on `glob` passes over it
     files = sorted(folder.glob("*.yaml"))
     if not files:
         raise InputError(f"{folder}: no studies (*.yaml) here; `rhmc study copy NAME` writes one of this package")

@@ -56,7 +56,7 @@ def reading_address(path: Path) -> str:
 
 def connect(path: Path, *, write: bool = False) -> sqlite3.Connection:
     """A database that is there, beside whoever else writes."""
-    return sqlite3.connect(f"{_uri(path)}?mode=rw" if write else _reading(path), PATIENCE, uri=True)
+    return sqlite3.connect(f"{_uri(path)}?mode=rw" if write else _reading(path), timeout=PATIENCE, uri=True)
 
 
 def _reading(path: Path) -> str:

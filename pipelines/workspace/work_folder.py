@@ -46,11 +46,22 @@ def work_folder() -> Path:
     name = os.path.expanduser(os.environ.get("RHMC_HOME") or "work")
     try:
         name.encode()
-        return Path(name).resolve()
+        return _followed(Path(name))
     except UnicodeEncodeError as error:
         raise StoreError(f"RHMC_HOME={name!a}: not in UTF-8; name another folder") from error
     except (OSError, RuntimeError) as error:  # links that lead to themselves
         raise StoreError(f"RHMC_HOME={name}: {reason(error)}; name another folder") from error
+
+
+def _followed(path: Path) -> Path:
+    """The path without links. Links that lead to themselves are an error before Python 3.13 alone."""
+    found = path.resolve()
+    try:
+        found.stat()
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise
+    return found
 
 
 class Home:

@@ -12,6 +12,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import pandas as pd
 
+from reports.data.drawn import files_in
 from reports.data.exported import older
 from reports.data.frame import FINAL, TableError
 from reports.data.stats import Interval, Values, difference, equivalence, equivalence_of_pairs
@@ -50,7 +51,7 @@ def read(folder: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
     Raises:
         TableError: there is none, or one is not readable, or of an older version.
     """
-    names = sorted(file.name.removesuffix(".runs.parquet") for file in folder.glob("*.runs.parquet"))
+    names = [file.name.removesuffix(".runs.parquet") for file in files_in(folder, "*.runs.parquet")]
     names = [name for name in names if (folder / f"{name}.parquet").is_file()]
     if not names:
         raise TableError(f"{folder}: no exported tables (*.runs.parquet) here")

@@ -18,7 +18,17 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from reports.data.drawn import METHOD, METHODS, Build, Scenes, content, read_methods, read_modules, read_scenes
+from reports.data.drawn import (
+    METHOD,
+    METHODS,
+    Build,
+    Scenes,
+    content,
+    files_in,
+    read_methods,
+    read_modules,
+    read_scenes,
+)
 from reports.data.escaping import markdown
 from reports.data.exported import (
     ASSIGNED,
@@ -286,7 +296,7 @@ def load(folder: Path, profile: str, only: str | None = None) -> Results:
         TableError: the folder holds no tables, or not those of the study, or they are faulty.
     """
     try:
-        files = sorted(folder.glob("*.parquet"))
+        files = files_in(folder, "*.parquet")
     except OSError as error:
         raise TableError(f"{folder}: cannot be read ({error.strerror})") from error
     if not files:

@@ -1,12 +1,12 @@
 """From a log to the three files that the reports read."""
 
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
-import torch
 
 from pipelines.export.pace import estimated, paces
 from pipelines.export.tables import export_study, write_tables
@@ -73,7 +73,7 @@ def test_where_a_run_was_started_is_told_where_it_is_known(tracker: MemoryTracke
     told = made(tmp_path)[["machine", "versions"]]
     assert told.loc["slow"].tolist() == ["a machine", "torch 2"]
     assert told.loc["fast"].tolist() == ["", ""]
-    assert f"torch {torch.__version__}" in host().versions
+    assert f"torch {version('torch')}" in host().versions
 
 
 def test_one_row_per_planned_run(tracker: MemoryTracker, tmp_path: Path) -> None:
