@@ -98,7 +98,7 @@ def _networks(method: RHMC, obs: Obs) -> Iterator[Record]:
         "executor critic",
         low.critic.net,
         taken,
-        lambda x: low.critic.net(executor.with_assignment(view(x), x["assignment"]), joint=x["others' actions"]),
+        lambda x: low.critic.net(low.critic_obs(view(x), x["assignment"]), joint=x["others' actions"]),
     )
 
 

@@ -1,8 +1,8 @@
 """The low level: shared actor and central critic that act under an assignment (section 4.3, Eq. 10 to 13).
 
-The actor sees its own (filtered) row and its assignment; the critic sees everything, every assignment and the other
-agents' actions, and has one output per own action. The bootstrap keeps the assignment that was acted under, so that the
-executors' task does not change with the coordinator.
+The actor sees its own (filtered) row and its assignment; the critic sees everything, the other agents' actions and, by
+`critic_sees`, every assignment, and has one output per own action. The bootstrap keeps the assignment that was acted
+under, so that the executors' task does not change with the coordinator.
 """
 
 from collections.abc import Callable
@@ -35,6 +35,9 @@ class Settings(Frozen):
     reward: Literal["local", "team"] = Field(
         "local", description="reward of the executors: their scores on assigned targets, or the team's reward"
     )
+    critic_sees: Literal["all", "none"] = Field(
+        "all", description="assignments that the critic is told, or QMIX's mixture: all of them; or none, as in Q(x, a)"
+    )
     gamma: float = Field(0.99, ge=0, le=1)
     standardise: Scale = Field("none", description="as `standardise` of other methods")
     epsilon: float = Field(0.05, ge=0, le=1, description="share of actions drawn at random while exploring")
@@ -55,6 +58,7 @@ class Executor:
     def __init__(self, cfg: Config, spec: Spec, rng: Generator) -> None:
         self.cfg, self.actions = cfg.executor, spec.actions
         self.filter, self.reward_fn = cfg.filter, REWARDS[self.cfg.reward]
+        self.critic_obs = partial(critic_obs, cfg)
         policies = {"gumbel": partial(straight_through, rng=rng), "expected": partial(torch.softmax, dim=-1)}
         self.policy: Callable[[Tensor], Tensor] = policies[self.cfg.method]
         encoder, sizes = ENCODERS[cfg.encoder], Sizes.of(spec, pair=1)
@@ -81,7 +85,7 @@ class Executor:
     def update(self, rows: Batch) -> Batch:
         """One step of the critic (Eq. 11) and one of the actor (Eq. 13, ascent)."""
         g, obs, joint = rows["assignment"], unpack(rows), self._one_hot(rows["action"])
-        q = self.critic.net(with_assignment(obs, g), joint=joint)
+        q = self.critic.net(self.critic_obs(obs, g), joint=joint)
         chosen = taken(q, rows["action"])
         td_target = self._target(rows)
         self.standardiser.update_returns(td_target)
@@ -97,9 +101,8 @@ class Executor:
     def _target(self, rows: Batch) -> Tensor:
         g, after = rows["assignment"], unpack(rows, "next_")
         best = self.actor.target_net(filtered_obs(self.filter, after, g)).argmax(-1)
-        value = self.standardiser.value(
-            taken(self.critic.target_net(with_assignment(after, g), joint=self._one_hot(best)), best)
-        )
+        q = self.critic.target_net(self.critic_obs(after, g), joint=self._one_hot(best))
+        value = self.standardiser.value(taken(q, best))
         return self.standardiser.reward(rows["reward"]) + self.cfg.gamma * (~rows["terminated"]).unsqueeze(-1) * value
 
     def _one_hot(self, action: Tensor) -> Tensor:
@@ -121,14 +124,19 @@ class Executor:
         checkpoint.load_parts(state, self._parts())
 
 
-def with_assignment(obs: Obs, assignment: Tensor) -> Obs:
-    """The observation with the assignment as the last feature of every pair."""
-    return append(obs, pair=assignment.unsqueeze(-1))
+def with_assignment(obs: Obs, assignment: Tensor, *, told: bool = True) -> Obs:
+    """The observation with the assignment as the last feature of every pair, or 0 there if it is not `told`."""
+    return append(obs, pair=(assignment if told else torch.zeros_like(assignment)).unsqueeze(-1))
 
 
 def filtered_obs(name: str, obs: Obs, assignment: Tensor) -> Obs:
     """The observation of an executor: filtered by the filter `name` (Eq. 10), with the assignment."""
     return with_assignment(obs._replace(pairs=FILTERS[name](obs.pairs, assignment)), assignment)
+
+
+def critic_obs(cfg: Config, obs: Obs, assignment: Tensor) -> Obs:
+    """The observation of a critic: everything, with every assignment or none (Eq. 11 has Q(x, a))."""
+    return with_assignment(obs, assignment, told=cfg.executor.critic_sees == "all")
 
 
 def _local(t: Transition, assignment: Tensor) -> Tensor:

@@ -152,6 +152,24 @@ def test_an_executor_knows_which_targets_are_its_own(mode: str) -> None:
 
 
 @pytest.mark.parametrize("encoder", ["mlp", "pairwise"])
+def test_what_the_critic_is_told_of_the_assignment(encoder: str) -> None:
+    """All of it, now and in the bootstrap; with `none` neither, as if it were always nothing."""
+    data = rows(40, reward=torch.zeros(40, N), action=torch.zeros(40, N, dtype=torch.int64))
+
+    def judged(held: Tensor, net: str, **changes: Any) -> Tensor:
+        torch.manual_seed(0)
+        low = Executor(config(encoder=encoder, **changes), SPEC, seeded())
+        constant(low.actor.target_net, [0.0, 3.0, 1.0])
+        (found,) = outputs(getattr(low.critic, net), lambda: low.update(data | {"assignment": held}))
+        return found
+
+    every, nothing = torch.ones(40, N, M), torch.zeros(40, N, M)
+    for net in ("net", "target_net"):
+        assert not torch.allclose(judged(every, net), judged(nothing, net), atol=1e-3)
+        assert torch.equal(judged(every, net, executor__critic_sees="none"), judged(nothing, net))
+
+
+@pytest.mark.parametrize("encoder", ["mlp", "pairwise"])
 def test_the_slow_copies_and_the_other_network_of_a_level_are_left_alone(encoder: str) -> None:
     """Each optimiser moves its own network only: with a step of zero for one, only the other moves."""
     low, high = Executor(config(encoder=encoder), SPEC, seeded()), Coordinator(config(encoder=encoder), SPEC, seeded())
