@@ -87,12 +87,11 @@ def _networks(method: RHMC, obs: Obs) -> Iterator[Record]:
         given,
         lambda x: assignment_value(high.critic.net, view(x), x["assignment"]),
     )
-    filtered = method.cfg.filter
     yield trace(
         "executor actor",
         low.actor.net,
         given,
-        lambda x: low.actor.net(executor.filtered_obs(filtered, view(x), x["assignment"])),
+        lambda x: low.actor.net(low.actor_obs(view(x), x["assignment"])),
     )
     yield trace(
         "executor critic",

@@ -35,6 +35,9 @@ class Settings(Frozen):
     reward: Literal["local", "team"] = Field(
         "local", description="reward of the executors: their scores on assigned targets, or the team's reward"
     )
+    told: Literal["always", "filtered"] = Field(
+        "always", description="an executor is told its assignment: always, or where the filter is on, and else nothing"
+    )
     critic_sees: Literal["all", "none"] = Field(
         "all", description="assignments that the critic is told, or QMIX's mixture: all of them; or none, as in Q(x, a)"
     )
@@ -57,8 +60,8 @@ class Executor:
 
     def __init__(self, cfg: Config, spec: Spec, rng: Generator) -> None:
         self.cfg, self.actions = cfg.executor, spec.actions
-        self.filter, self.reward_fn = cfg.filter, REWARDS[self.cfg.reward]
-        self.critic_obs = partial(critic_obs, cfg)
+        self.reward_fn = REWARDS[self.cfg.reward]
+        self.actor_obs, self.critic_obs = partial(actor_obs, cfg), partial(critic_obs, cfg)
         policies = {"gumbel": partial(straight_through, rng=rng), "expected": partial(torch.softmax, dim=-1)}
         self.policy: Callable[[Tensor], Tensor] = policies[self.cfg.method]
         encoder, sizes = ENCODERS[cfg.encoder], Sizes.of(spec, pair=1)
@@ -71,7 +74,7 @@ class Executor:
 
     def act(self, obs: Obs, assignment: Tensor, rng: Generator, *, explore: bool) -> Tensor:
         """Actions (B, N) int64: sampled from the softened policy, or its greatest logit."""
-        logits = self.actor.net(filtered_obs(self.filter, obs, assignment))
+        logits = self.actor.net(self.actor_obs(obs, assignment))
         if explore:
             logits = mix(logits.softmax(-1), 1 / self.actions, self.cfg.epsilon).log() + gumbel(logits.shape, rng)
         return logits.argmax(-1)
@@ -90,7 +93,7 @@ class Executor:
         td_target = self._target(rows)
         self.standardiser.update_returns(td_target)
         td = mse_loss(chosen, self.standardiser.target(td_target))
-        logits = self.actor.net(filtered_obs(self.filter, obs, g))
+        logits = self.actor.net(self.actor_obs(obs, g))
         gain = (q.detach() * self.policy(logits)).sum(-1).mean()
         self.critic.update(td)
         self.actor.update(self.cfg.logit_penalty * logits.square().mean() - gain)
@@ -100,7 +103,7 @@ class Executor:
     @torch.no_grad()
     def _target(self, rows: Batch) -> Tensor:
         g, after = rows["assignment"], unpack(rows, "next_")
-        best = self.actor.target_net(filtered_obs(self.filter, after, g)).argmax(-1)
+        best = self.actor.target_net(self.actor_obs(after, g)).argmax(-1)
         q = self.critic.target_net(self.critic_obs(after, g), joint=self._one_hot(best))
         value = self.standardiser.value(taken(q, best))
         return self.standardiser.reward(rows["reward"]) + self.cfg.gamma * (~rows["terminated"]).unsqueeze(-1) * value
@@ -129,9 +132,10 @@ def with_assignment(obs: Obs, assignment: Tensor, *, told: bool = True) -> Obs:
     return append(obs, pair=(assignment if told else torch.zeros_like(assignment)).unsqueeze(-1))
 
 
-def filtered_obs(name: str, obs: Obs, assignment: Tensor) -> Obs:
-    """The observation of an executor: filtered by the filter `name` (Eq. 10), with the assignment."""
-    return with_assignment(obs._replace(pairs=FILTERS[name](obs.pairs, assignment)), assignment)
+def actor_obs(cfg: Config, obs: Obs, assignment: Tensor) -> Obs:
+    """The observation of an executor: filtered (Eq. 10), with the assignment or, untold without the filter, zeros."""
+    seen = obs._replace(pairs=FILTERS[cfg.filter](obs.pairs, assignment))
+    return with_assignment(seen, assignment, told=cfg.filter == "on" or cfg.executor.told == "always")
 
 
 def critic_obs(cfg: Config, obs: Obs, assignment: Tensor) -> Obs:

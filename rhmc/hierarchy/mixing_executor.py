@@ -10,7 +10,7 @@ import torch
 from torch import Generator, Tensor, nn
 from torch.nn.functional import mse_loss
 
-from rhmc.hierarchy.executor import REWARDS, Config, critic_obs, filtered_obs
+from rhmc.hierarchy.executor import REWARDS, Config, actor_obs, critic_obs
 from rhmc.learning import checkpoint
 from rhmc.learning.learner import Learner, Learners, pack_step, taken, unpack
 from rhmc.learning.normalisation import Standardiser
@@ -31,7 +31,7 @@ class Values(nn.Module):
 
     def forward(self, obs: Obs, assignment: Tensor) -> Tensor:
         """Values (B, N, actions)."""
-        return self.own(filtered_obs(self.cfg.filter, obs, assignment))
+        return self.own(actor_obs(self.cfg, obs, assignment))
 
     def mixed(self, obs: Obs, assignment: Tensor, action: Tensor) -> Tensor:
         """Value (B,) of a joint action (B, N)."""

@@ -14,7 +14,7 @@ from rhmc.envs.base import Env
 from rhmc.hierarchy.coordinator import Coordinator, assignment_value, differences
 from rhmc.hierarchy.executor import Executor
 from rhmc.hierarchy.regulation import REGULATORS
-from rhmc.learning.learner import Learner
+from rhmc.learning.learner import Learner, unpack
 from rhmc.learning.normalisation import KEPT
 from rhmc.networks.nets import ENCODERS, PairNet, Sizes, append
 from rhmc.types import Batch, Obs, Spec, Transition, assigned_reward
@@ -149,6 +149,28 @@ def test_an_executor_knows_which_targets_are_its_own(mode: str) -> None:
     one, all_ = (torch.zeros(3, N, M), torch.ones(3, N, M))
     (a,), (b,) = (outputs(low.actor.net, lambda g=g: low.act(obs, g, seeded(), explore=False)) for g in (one, all_))
     assert not torch.allclose(a, b)
+
+
+@pytest.mark.parametrize("encoder", ["mlp", "pairwise"])
+@pytest.mark.parametrize("mode", ["on", "off"])
+def test_without_the_filter_an_executor_may_be_told_nothing(encoder: str, mode: str) -> None:
+    """Acting and in both passes of its actor while learning; where the filter is on that changes nothing."""
+    data = rows(40, reward=torch.zeros(40, N), action=torch.zeros(40, N, dtype=torch.int64))
+
+    def seen(held: Tensor, **changes: Any) -> list[Tensor]:
+        torch.manual_seed(0)
+        low = Executor(config(encoder=encoder, filter=mode, lr=1e-9, tau=0.0, **changes), SPEC, seeded())
+        given = data | {"assignment": held}
+        acting = outputs(low.actor.net, lambda: low.act(unpack(given), held, seeded(), explore=False))
+        learning = [outputs(net, lambda: low.update(given)) for net in (low.actor.net, low.actor.target_net)]
+        return acting + [out for found in learning for out in found]
+
+    held, nothing = data["assignment"], torch.zeros(40, N, M)
+    told, untold = seen(held), seen(held, executor__told="filtered")
+    assert len(told) == len(untold) == 3
+    for a, b, c in zip(told, untold, seen(nothing), strict=True):
+        assert torch.equal(b, a if mode == "on" else c)
+        assert not torch.allclose(a, c, atol=1e-3)
 
 
 @pytest.mark.parametrize("encoder", ["mlp", "pairwise"])
