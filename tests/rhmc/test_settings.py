@@ -113,6 +113,7 @@ tau >= 0 <= 1: 0.02 (coma)
 td_lambda >= 0 <= 1: 0.9 (coma)
 threads >= 1: 1 (trainer)
 train_freq >= 1: 64 (rhmc, qmix, vdn, iql, maddpg, hitmac)
+unassigned: 'free' (rhmc)
 """
 
 

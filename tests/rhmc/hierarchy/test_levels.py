@@ -13,7 +13,7 @@ from rhmc.envs import coverage, make_env, navigation
 from rhmc.envs.base import Env
 from rhmc.hierarchy.coordinator import Coordinator, assignment_value, differences
 from rhmc.hierarchy.executor import Executor
-from rhmc.hierarchy.regulation import REGULATORS
+from rhmc.hierarchy.regulation import REGULATORS, Charges
 from rhmc.learning.learner import Learner, unpack
 from rhmc.learning.normalisation import KEPT
 from rhmc.networks.nets import ENCODERS, PairNet, Sizes, append
@@ -433,24 +433,28 @@ def begin(world: str, batch: int, **changes: Any) -> tuple[RHMC, Env]:
 @pytest.mark.parametrize("world", WORLDS)
 @pytest.mark.parametrize("regulator", REGULATORS)
 @pytest.mark.parametrize("period", [1, 3])
-def test_high_rows_are_those_of_the_periods_worked_out_one_by_one(world: str, regulator: str, period: int) -> None:
+@pytest.mark.parametrize("unassigned", ["free", "charged"])
+def test_high_rows_are_those_of_the_periods_worked_out_one_by_one(
+    world: str, regulator: str, period: int, unassigned: Any
+) -> None:
     """Each period: from the observation it was drawn in, max(mean of Eq. 6 earned, bound when drawn), to its last one.
 
     An episode of 7 steps cuts a period of 3 short: 3 + 3 + 1.
     """
-    alpha = 0.3
-    algo, env = begin(world, 24, regulator=regulator, assignment_period=period, alpha=alpha, buffer_size=900)
+    charges = Charges(0.3, unassigned)
+    changes = {"regulator": regulator, "assignment_period": period, **charges._asdict()}
+    algo, env = begin(world, 24, buffer_size=900, **changes)
     expected: list[dict[str, Any]] = []
     periods: list[dict[str, Any]] = [{} for _ in range(24)]
     for step, (t, table, _) in enumerate(play(algo, env, 17)):
         held, at = t.extra["assignment"], step % 7 % period
         for k in range(24):
             if at == 0:
-                bound = _bound(regulator, table[k], held[k], alpha)
+                bound = _bound(regulator, table[k], held[k], charges)
                 periods[k] = {"pairs": t.obs.pairs[k], "held": held[k], "earned": [], "bound": bound}
             assert torch.equal(held[k], periods[k]["held"])
             done = (t.completed[k] & held[k].bool()).any(0).tolist()
-            periods[k]["earned"].append(oracle.reward(done, held[k].int().tolist(), alpha))
+            periods[k]["earned"].append(oracle.reward(done, held[k].int().tolist(), *charges))
             if at == period - 1 or step % 7 == 6:
                 expected.append(periods[k] | {"next": t.next_obs.pairs[k]})
     stored = algo.state_dict()["high"]["rows"]
@@ -468,13 +472,13 @@ def test_high_rows_are_those_of_the_periods_worked_out_one_by_one(world: str, re
         assert (stored["reward"] > stored["earned"]).any()
 
 
-def _bound(regulator: str, options: Tensor, held: Tensor, alpha: float) -> float:
+def _bound(regulator: str, options: Tensor, held: Tensor, charges: Charges) -> float:
     """By the slow oracles: every joint option, or Algorithm 1 line by line."""
     if regulator == "none":
         return -float("inf")
     slow = {"paper": oracle.algorithm1, "exact": oracle.optimum}[regulator]
     masked = (options & held.bool().unsqueeze(1)).tolist()
-    return slow(masked, held.int().tolist(), alpha)
+    return slow(masked, held.int().tolist(), *charges)
 
 
 def test_low_rows_are_every_step_under_the_assignment_held() -> None:
