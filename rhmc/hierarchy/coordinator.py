@@ -28,6 +28,7 @@ class Settings(Frozen):
     reward: Literal["assigned", "team"] = Field(
         "assigned", description="reward of the coordinator: Eq. 6, or the team's reward, which knows no regulation"
     )
+    lr: float | None = Field(None, gt=0, description="Adam's step size at this level instead of the method's")
     gamma: float = Field(0.99, ge=0, le=1, description="per assignment period")
     standardise: Scale = Field("none", description="as `standardise` of other methods")
     ent_coef: float = Field(0.2, ge=0, description="weight of the assignment's entropy, for advantages of deviation 1")
@@ -37,7 +38,7 @@ class Settings(Frozen):
 
 
 class Config(TargetNetworks):
-    """Settings of a method with this coordinator; lr is the paper's."""
+    """Settings of a method with this coordinator; lr is the paper's, for both levels."""
 
     coordinator: Settings = Settings()
 
@@ -51,8 +52,9 @@ class Coordinator:
         encoder = ENCODERS[cfg.encoder]
         actor = encoder.pairs(Sizes.of(spec), cfg.hidden_dim, 1).to(rng.device)
         critic = encoder.pairs(Sizes.of(spec, pair=1), cfg.hidden_dim, 1).to(rng.device)
-        self.actor = Learner(actor, lr=cfg.lr, tau=cfg.tau, max_grad_norm=cfg.max_grad_norm)
-        self.critic = Learner(critic, lr=cfg.lr, tau=cfg.tau, max_grad_norm=cfg.max_grad_norm)
+        lr = self.cfg.lr or cfg.lr
+        self.actor = Learner(actor, lr=lr, tau=cfg.tau, max_grad_norm=cfg.max_grad_norm)
+        self.critic = Learner(critic, lr=lr, tau=cfg.tau, max_grad_norm=cfg.max_grad_norm)
         self.standardiser = Standardiser(self.cfg.standardise, rng.device)
 
     def assign(self, obs: Obs, rng: Generator, *, explore: bool) -> Tensor:

@@ -41,6 +41,7 @@ class Settings(Frozen):
     critic_sees: Literal["all", "none"] = Field(
         "all", description="assignments that the critic is told, or QMIX's mixture: all of them; or none, as in Q(x, a)"
     )
+    lr: float | None = Field(None, gt=0, description="Adam's step size at this level instead of the method's")
     gamma: float = Field(0.99, ge=0, le=1)
     standardise: Scale = Field("none", description="as `standardise` of other methods")
     epsilon: float = Field(0.05, ge=0, le=1, description="share of actions drawn at random while exploring")
@@ -68,8 +69,9 @@ class Executor:
         local = partial(encoder.local, sizes, cfg.hidden_dim, spec.actions)
         central = partial(encoder.central, sizes, cfg.hidden_dim, spec.actions, joint=spec.actions)
         actor, critic = (team(make, spec.agents, share=cfg.share).to(rng.device) for make in (local, central))
-        self.actor = Learner(actor, lr=cfg.lr, tau=cfg.tau, max_grad_norm=cfg.max_grad_norm)
-        self.critic = Learner(critic, lr=cfg.lr, tau=cfg.tau, max_grad_norm=cfg.max_grad_norm)
+        lr = self.cfg.lr or cfg.lr
+        self.actor = Learner(actor, lr=lr, tau=cfg.tau, max_grad_norm=cfg.max_grad_norm)
+        self.critic = Learner(critic, lr=lr, tau=cfg.tau, max_grad_norm=cfg.max_grad_norm)
         self.standardiser = Standardiser(self.cfg.standardise, rng.device)
 
     def act(self, obs: Obs, assignment: Tensor, rng: Generator, *, explore: bool) -> Tensor:

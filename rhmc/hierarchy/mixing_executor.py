@@ -45,7 +45,8 @@ class QMIXExecutor:
     def __init__(self, cfg: Config, spec: Spec, rng: Generator) -> None:
         self.cfg, self.actions = cfg.executor, spec.actions
         self.reward_fn = REWARDS[self.cfg.reward]
-        self.q = Learner(Values(cfg, spec).to(rng.device), lr=cfg.lr, tau=cfg.tau, max_grad_norm=cfg.max_grad_norm)
+        values, lr = Values(cfg, spec).to(rng.device), self.cfg.lr or cfg.lr
+        self.q = Learner(values, lr=lr, tau=cfg.tau, max_grad_norm=cfg.max_grad_norm)
         self.standardiser = Standardiser(self.cfg.standardise, rng.device)
 
     def act(self, obs: Obs, assignment: Tensor, rng: Generator, *, explore: bool) -> Tensor:

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from rhmc.algorithms import ALGORITHMS
 from rhmc.algorithms.rhmc import RHMC, Config
 from rhmc.envs import coverage, make_env, navigation
 from rhmc.envs.base import Env
@@ -47,6 +48,21 @@ def outputs(net: nn.Module, call: Any) -> list[Tensor]:
     handle.remove()
     assert seen
     return seen
+
+
+# Step sizes
+
+
+@pytest.mark.parametrize(("kind", "method"), [("rhmc", "gumbel"), ("rhmc", "qmix"), ("hitmac", "expected")])
+def test_a_level_may_have_a_step_size_of_its_own(kind: str, method: str) -> None:
+    sizes: list[dict[str, Any]] = [{}, {"executor.lr": 2e-3}, {"coordinator.lr": 3e-3}]
+    for own in [*sizes, sizes[1] | sizes[2]]:
+        cfg = ALGORITHMS[kind].config(**nested({"lr": 1e-3, "executor.method": method} | own))
+        algo: Any = ALGORITHMS[kind].build(cfg, SPEC, 4, seeded())
+        for name in ("executor", "coordinator"):
+            learners = getattr(algo, name).learners()
+            steps = {group["lr"] for learner in learners for group in learner.optimiser.param_groups}
+            assert steps == {learner.lr for learner in learners} == {own.get(f"{name}.lr", 1e-3)}
 
 
 # Executor
