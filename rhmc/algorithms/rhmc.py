@@ -109,11 +109,15 @@ class RHMC:
         self.high.add(rows)
 
     def _period(self, t: Transition) -> Batch:
-        """Rows of B_h: state, assignment, regulated reward (Alg. 1 against what was earned) and next state."""
+        """Rows of B_h: state, assignment, regulated reward (Alg. 1 against what was earned) and next state.
+
+        And the `share` of a whole period that it took: an episode's end may have come first.
+        """
         p = self.pending
         rows = {key: p[key] for key in ("agents", "pairs", "peers", "assignment")} | pack(t.next_obs, "next_")
-        earned = p["earned"] / p["length"]
-        return rows | {"reward": torch.maximum(earned, p["bound"]), "earned": earned, "terminated": t.terminated}
+        earned, share = p["earned"] / p["length"], p["length"] / self.cfg.assignment_period
+        rows |= {"reward": torch.maximum(earned, p["bound"]), "earned": earned, "share": share}
+        return rows | {"terminated": t.terminated}
 
     def update(self) -> Batch:
         """One update of the executors for every `train_freq` steps since `learning_starts`, once a period has ended.

@@ -65,13 +65,17 @@ class Coordinator:
         return (logits > 0).float()
 
     def update(self, rows: Batch) -> Batch:
-        """One step of the critic (Eq. 7) and one of the actor (Eq. 9)."""
+        """One step of the critic (Eq. 7) and one of the actor (Eq. 9).
+
+        The value after a period that an episode's end shortened is discounted by the period's `share` of a whole one.
+        """
         obs, after = unpack(rows), unpack(rows, "next_")
         with torch.no_grad():
             best = (self.actor.target_net(after).squeeze(-1) > 0).float()
             live = (~rows["terminated"]).float()
             value = self.standardiser.value(assignment_value(self.critic.target_net, after, best))
-            td_target = self.standardiser.reward(rows["reward"]) + self.cfg.gamma * live * value
+            discount = self.cfg.gamma ** rows["share"] * live
+            td_target = self.standardiser.reward(rows["reward"]) + discount * value
             self.standardiser.update_returns(td_target)
         q = assignment_value(self.critic.net, obs, rows["assignment"])
         td = mse_loss(q, self.standardiser.target(td_target))

@@ -37,7 +37,8 @@ def rows(batch: int = 1, terminated: bool = False, **changes: Tensor) -> Batch:
     """The columns that both levels may be given; rewards are added by the test."""
     held = (torch.rand(batch, N, M) < 0.5).float()
     some = observed(SPEC, batch)
-    return some | {"assignment": held, "terminated": torch.full((batch,), terminated)} | changes
+    whole = {"terminated": torch.full((batch,), terminated), "share": torch.ones(batch)}
+    return some | {"assignment": held} | whole | changes
 
 
 def outputs(net: nn.Module, call: Any) -> list[Tensor]:
@@ -237,14 +238,24 @@ def _values(learner: Learner) -> list[Tensor]:
 @pytest.mark.parametrize("gradient", ["ddpg", "counterfactual"])
 @pytest.mark.parametrize("encoder", ["mlp", "pairwise"])
 @pytest.mark.parametrize("terminated", [False, True])
-def test_coordinator_target_by_hand(gradient: str, encoder: str, terminated: bool) -> None:
-    """The critic is a sum over the six pairs: 6 x 0.5 now, 6 x 2 later."""
+@pytest.mark.parametrize(("share", "discount"), [(1.0, 0.25), (0.5, 0.5)])
+def test_coordinator_target_by_hand(
+    gradient: str, encoder: str, terminated: bool, share: float, discount: float
+) -> None:
+    """The critic is a sum over the six pairs: 6 x 0.5 now, 6 x 2 later. Half a period has the root of the discount."""
     high = Coordinator(config(encoder=encoder, coordinator__gradient=gradient), SPEC, seeded())
     constant(high.critic.net, [0.5])
     constant(high.critic.target_net, [2.0])
-    logs = high.update(rows(terminated=terminated, reward=torch.tensor([0.75]), earned=torch.tensor([0.0])))
-    target = 0.75 if terminated else 0.75 + 0.25 * N * M * 2
+    pay = {"reward": torch.tensor([0.75]), "earned": torch.tensor([0.0])}
+    logs = high.update(rows(terminated=terminated, share=torch.tensor([share]), **pay))
+    target = 0.75 if terminated else 0.75 + discount * N * M * 2
     assert logs["high_td"].item() == pytest.approx((N * M * 0.5 - target) ** 2)
+
+
+def test_a_whole_period_has_the_discount_to_the_last_bit() -> None:
+    """So that nothing depends on the power where periods divide an episode."""
+    gammas = torch.linspace(0, 1, 5001, dtype=torch.float64).tolist()
+    assert all((gamma ** torch.ones(9) == torch.tensor(gamma)).all() for gamma in gammas)
 
 
 def test_coordinator_standardises_rewards_or_returns_by_those_seen() -> None:
@@ -479,6 +490,7 @@ def test_high_rows_are_those_of_the_periods_worked_out_one_by_one(
         earned = sum(period_["earned"]) / len(period_["earned"])
         assert stored["earned"][k].item() == pytest.approx(earned, abs=1e-6)
         assert stored["reward"][k].item() == pytest.approx(max(earned, period_["bound"]), abs=1e-6)
+        assert stored["share"][k].item() == pytest.approx(len(period_["earned"]) / period)
         assert torch.equal(stored["assignment"][k], period_["held"])
         assert torch.equal(stored["pairs"][k], period_["pairs"])
         assert torch.equal(stored["next_pairs"][k], period_["next"])
