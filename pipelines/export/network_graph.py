@@ -87,18 +87,17 @@ def _networks(method: RHMC, obs: Obs) -> Iterator[Record]:
         given,
         lambda x: assignment_value(high.critic.net, view(x), x["assignment"]),
     )
-    filtered = method.cfg.filter
     yield trace(
         "executor actor",
         low.actor.net,
         given,
-        lambda x: low.actor.net(executor.filtered_obs(filtered, view(x), x["assignment"])),
+        lambda x: low.actor.net(low.actor_obs(view(x), x["assignment"])),
     )
     yield trace(
         "executor critic",
         low.critic.net,
         taken,
-        lambda x: low.critic.net(executor.with_assignment(view(x), x["assignment"]), joint=x["others' actions"]),
+        lambda x: low.critic.net(low.critic_obs(view(x), x["assignment"]), joint=x["others' actions"]),
     )
 
 

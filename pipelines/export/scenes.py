@@ -10,7 +10,7 @@ import torch
 from torch import Generator, Tensor
 
 from rhmc.envs import coverage, navigation
-from rhmc.hierarchy.regulation import Path, algorithm1_path, exact, optimal_path, paper
+from rhmc.hierarchy.regulation import Charges, Path, algorithm1_path, exact, optimal_path, paper
 from rhmc.hierarchy.theorem import smallest_counterexample
 from rhmc.yardsticks import POLICIES
 
@@ -21,6 +21,7 @@ SENSORS = (2, 3, 4, 5, 6)  # Figures 8 and 9
 TARGETS = 5
 TURNED = 50  # steps before a picture of coverage: sensors have turned to what they found
 ALPHA = 0.1
+CHARGES = Charges(ALPHA)
 HORIZON = 6  # steps that an agent may act: at one step Algorithm 1 has too few options to go wrong
 EPISODES, EVERY, LENGTH = 400, 5, 60  # of the search for an instance: how many, a state every so many steps, until then
 TOLERANCE = 1e-5  # above rounding; a true gap is a sum of differences of 1/k
@@ -110,7 +111,7 @@ def _counterexample(by: Literal["reward", "count"]) -> Record:
 def _instance(kept: list[Tensor], held: Tensor) -> Record:
     """The targets that each agent's options complete, N times (D_i, M), the assignment (N, M), and both paths."""
     options = _padded(kept)
-    paths = {"algorithm_1": algorithm1_path(options, held, ALPHA), "optimum": optimal_path(options, held, ALPHA)}
+    paths = {"algorithm_1": algorithm1_path(options, held, CHARGES), "optimum": optimal_path(options, held, CHARGES)}
     return {
         "alpha": ALPHA,
         "assignment": held.int().tolist(),
@@ -136,7 +137,7 @@ def _met(horizon: int, policy: str = "nearest") -> Met:
             options.append(coverage.options(cfg, state, horizon))
             assignments.append(torch.rand(EPISODES, cfg.agents, cfg.targets, generator=rng) < 0.5)
     all_options, assignment = torch.cat(options), torch.cat(assignments)
-    gap = exact(all_options, assignment, ALPHA) - paper(all_options, assignment, ALPHA)
+    gap = exact(all_options, assignment, CHARGES) - paper(all_options, assignment, CHARGES)
     return Met(all_options, assignment, gap)
 
 

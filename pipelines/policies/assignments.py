@@ -17,7 +17,7 @@ from pipelines.tracking.plan import Item, chosen, items
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.process_pool import side_by_side
 from reports.data.schema import METRICS
-from rhmc.hierarchy.regulation import exact, paper
+from rhmc.hierarchy.regulation import Charges, exact, paper
 from rhmc.training.trainer import Trainer
 from rhmc.types import Metrics, Transition
 
@@ -27,6 +27,7 @@ ASSIGNING = ("rhmc", "hitmac")  # methods that assign targets
 HORIZONS = (1, 6)  # steps that an agent may act, as Figure 4 has them
 EVERY = 8  # steps from one look to the next: neighbouring states are much alike
 ALPHA = 0.1  # penalty of Eq. 6, as in the table of random instances
+CHARGES = Charges(ALPHA)
 TOLERANCE = 1e-5  # above rounding
 
 Row = tuple[object, ...]
@@ -85,7 +86,7 @@ def counts(t: Transition) -> dict[str, Tensor]:
     }
     for horizon in HORIZONS:
         options = t.options(horizon)
-        gap = exact(options, held, ALPHA) - paper(options, held, ALPHA)
+        gap = exact(options, held, CHARGES) - paper(options, held, CHARGES)
         found[f"lost_h{horizon}"] = (gap > TOLERANCE).float()
         found[f"gap_h{horizon}"] = torch.where(gap > TOLERANCE, gap, 0.0)
     return found

@@ -66,7 +66,7 @@ def faults_of(key: str, node: Node, fields: Collection[str]) -> list[Fault]:
     section, _, field = key.partition(".")
     if not field or section not in {name.partition(".")[0] for name in fields}:
         same = [name for name in fields if name.endswith(f".{key}")]
-        near = f"; did you mean '{same[0]}'?" if same else nearest(key, fields)
+        near = f"; did you mean '{min(same, key=len)}'?" if same else nearest(key, fields)
         text = f"{show(key)} is no key of a run; a dotted name such as algo.alpha{near}"
         return [Fault(node.key, node.path, text)]
     texts = [text_of(value, i) for i, value in enumerate(values(node))]

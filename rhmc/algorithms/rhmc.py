@@ -4,8 +4,9 @@ Source: the RHMC paper, Eq. 6 to 13 and Algorithms 1 and 2; the levels are `rhmc
 `rhmc.hierarchy.executor`.
 Departures, each a field of `Config`: `coordinator.gradient: counterfactual` and `executor.method: expected` beside the
 paper's gradients; `executor.method: qmix` instead of actors (`rhmc.hierarchy.mixing_executor`); `regulator: exact`
-beside Algorithm 1, with a `horizon`; an assignment may be held (`assignment_period`); both levels may learn from the
-team's reward (`reward` of either block), each on a scale of its own (`standardise`).
+beside Algorithm 1, with a `horizon`; an assignment may be held (`assignment_period`); Eq. 6 may charge for targets that
+nobody is assigned to (`unassigned`); both levels may learn from the team's reward (`reward` of either block), each on a
+scale of its own (`standardise`).
 Eq. 7, 11 and 13 are read with standard signs; truncation bootstraps.
 """
 
@@ -18,7 +19,7 @@ from torch import Generator, Tensor
 from rhmc.algorithms.base import About, Method, register_method
 from rhmc.hierarchy import coordinator, executor
 from rhmc.hierarchy.mixing_executor import QMIXExecutor
-from rhmc.hierarchy.regulation import REGULATORS, executed
+from rhmc.hierarchy.regulation import REGULATORS, Charges, executed
 from rhmc.learning import checkpoint
 from rhmc.learning.experience import Experience
 from rhmc.learning.learner import Learners, Replay, choose, pack
@@ -43,6 +44,9 @@ class Config(coordinator.Config, executor.Config, Replayed):
     regulator: Literal["none", "paper", "exact"] = "paper"
     horizon: int = Field(1, ge=1, description="steps that the regulator lets an agent act")
     alpha: float = Field(0.1, ge=0, le=1, description="alpha_1 of Eq. 6")
+    unassigned: Literal["free", "charged"] = Field(
+        "free", description="whether Eq. 6 charges alpha for a target that is assigned to nobody"
+    )
     assignment_period: int = Field(1, ge=1, description="steps for which an assignment is held")
 
     @model_validator(mode="after")
@@ -59,6 +63,7 @@ class RHMC:
     def __init__(self, cfg: Config, spec: Spec, num_envs: int, rng: Generator) -> None:
         self.cfg, self.spec, self.rng = cfg, spec, rng
         self.regulate, self.reward_fn = REGULATORS[cfg.regulator], REWARDS[cfg.coordinator.reward]
+        self.charges = Charges(cfg.alpha, cfg.unassigned)
         self.coordinator = coordinator.Coordinator(cfg, spec, rng)
         self.executor = EXECUTORS[cfg.executor.method](cfg, spec, rng)
         self.low = Experience(cfg, cfg.executor.batch_size, rng)
@@ -93,10 +98,10 @@ class RHMC:
         if bool(t.extra["new"].any()):
             none = torch.zeros_like(t.reward)
             start = pack(t.obs) | {"assignment": g, "earned": none, "length": none}
-            start["bound"] = self.regulate(t.options(cfg.horizon), g, cfg.alpha)
+            start["bound"] = self.regulate(t.options(cfg.horizon), g, self.charges)
             self.pending = choose(t.extra["new"], start, self.pending or start)
         p = self.pending = dict(self.pending)
-        p["earned"] = p["earned"] + self.reward_fn(t, g, cfg.alpha)
+        p["earned"] = p["earned"] + self.reward_fn(t, g, self.charges)
         p["length"] = p["length"] + 1
         over = t.terminated | t.truncated | (p["length"] >= cfg.assignment_period)
         rows = {key: value[over] for key, value in self._period(t).items()}
@@ -104,11 +109,15 @@ class RHMC:
         self.high.add(rows)
 
     def _period(self, t: Transition) -> Batch:
-        """Rows of B_h: state, assignment, regulated reward (Alg. 1 against what was earned) and next state."""
+        """Rows of B_h: state, assignment, regulated reward (Alg. 1 against what was earned) and next state.
+
+        And the `share` of a whole period that it took: an episode's end may have come first.
+        """
         p = self.pending
         rows = {key: p[key] for key in ("agents", "pairs", "peers", "assignment")} | pack(t.next_obs, "next_")
-        earned = p["earned"] / p["length"]
-        return rows | {"reward": torch.maximum(earned, p["bound"]), "earned": earned, "terminated": t.terminated}
+        earned, share = p["earned"] / p["length"], p["length"] / self.cfg.assignment_period
+        rows |= {"reward": torch.maximum(earned, p["bound"]), "earned": earned, "share": share}
+        return rows | {"terminated": t.terminated}
 
     def update(self) -> Batch:
         """One update of the executors for every `train_freq` steps since `learning_starts`, once a period has ended.
@@ -142,11 +151,11 @@ class RHMC:
         self.pending = {key: value.to(self.rng.device) for key, value in state["pending"].items()}
 
 
-def _assigned(t: Transition, assignment: Tensor, alpha: float) -> Tensor:
-    return executed(t.completed, assignment, alpha)
+def _assigned(t: Transition, assignment: Tensor, charges: Charges) -> Tensor:
+    return executed(t.completed, assignment, charges)
 
 
-def _team(t: Transition, assignment: Tensor, alpha: float) -> Tensor:
+def _team(t: Transition, assignment: Tensor, charges: Charges) -> Tensor:
     return t.reward
 
 

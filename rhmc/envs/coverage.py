@@ -21,6 +21,7 @@ TURNS = (0.0, TURN, -TURN)  # by action
 GOAL_RADIUS, STUCK, PATIENCE = 5.0, 10.0, 100  # when a target redraws its goal
 FIRST_MOVE = 30.0  # distance that counts as moved before the first move
 REDRAWS = 50  # cap on moves that are decided again
+FEATURES = {"paper": 4, "extended": 10, "extended_own": 8}  # of a pair, by observation
 BOXES = (  # x0, x1, y0, y1 of each sensor's start
     (250, 750, 250, 750),
     (250, 750, -750, -250),
@@ -57,7 +58,7 @@ class Config(EnvConfig):
     preset: Literal["flat", "executor", "coordinator"] = "flat"
     agents: int = Field(4, ge=1)
     targets: int = Field(5, ge=1)
-    observation: Literal["paper", "extended"] = "paper"
+    observation: Literal["paper", "extended", "extended_own"] = "paper"
     penalty: float = Field(0.1, ge=0, description="minus this is the reward when nothing is captured")
     boxes: tuple[tuple[int, int, int, int], ...] = BOXES
 
@@ -89,7 +90,7 @@ class State(NamedTuple):
 
 def spec(cfg: Config) -> Spec:
     """Sizes for the networks."""
-    features = 4 if cfg.observation == "paper" else 10
+    features = FEATURES[cfg.observation]
     return Spec(cfg.agents, cfg.targets, 0, features, 0, len(TURNS), False, PRESETS[cfg.preset].episode)
 
 
@@ -194,7 +195,8 @@ def observe(cfg: Config, state: State) -> Obs:
 
     `paper`: (i/n, j/m, bearing/180, distance/2000). `extended`: sine and cosine of the bearing, its size, distance,
     radial and tangential part of the target's last move, visible to me, in my range, visible to another sensor, and how
-    closely another sensor that has it in range is turned to it.
+    closely another sensor that has it in range is turned to it. `extended_own`: without the last two, which tell
+    what other sensors do.
     """
     bearing, distance = relation(state)
     b, n, m = bearing.shape
@@ -203,7 +205,7 @@ def observe(cfg: Config, state: State) -> Obs:
         j = (torch.arange(m, device=bearing.device) / m).view(1, 1, m).expand(b, n, m)
         pairs = torch.stack((i, j, bearing / 180, distance / 2000), -1)
     else:
-        pairs = _extended(state, bearing, distance)
+        pairs = _extended(state, bearing, distance, others=cfg.observation == "extended")
     empty = bearing.new_zeros(b, n, 0)
     return Obs(empty, pairs, bearing.new_zeros(b, n, n, 0), state.steps == 0)
 
@@ -233,18 +235,20 @@ def wrap(degrees: Tensor) -> Tensor:
     return torch.remainder(degrees + 180, 360) - 180
 
 
-def _extended(state: State, bearing: Tensor, distance: Tensor) -> Tensor:
+def _extended(state: State, bearing: Tensor, distance: Tensor, *, others: bool) -> Tensor:
     seen, near = visible(bearing, distance), distance <= RANGE
     absolute = torch.deg2rad(bearing + state.heading.unsqueeze(-1))
     ray = torch.stack((absolute.cos(), absolute.sin()), -1)
     move = (state.targets - state.last).unsqueeze(1) / 30
     radial = (move * ray).sum(-1)
     tangential = move[..., 1] * ray[..., 0] - move[..., 0] * ray[..., 1]
-    closeness = _best_other(torch.where(near, 1 - bearing.abs() / 180, 0.0))
-    shared = seen.sum(1, keepdim=True) - seen.int() > 0
     angle = torch.deg2rad(bearing)
-    parts = (angle.sin(), angle.cos(), bearing.abs() / 180, distance / 2000, radial, tangential)
-    return torch.stack((*parts, seen.float(), near.float(), shared.float(), closeness), -1)
+    parts = [angle.sin(), angle.cos(), bearing.abs() / 180, distance / 2000, radial, tangential]
+    parts += [seen.float(), near.float()]
+    if others:
+        shared = seen.sum(1, keepdim=True) - seen.int() > 0
+        parts += [shared.float(), _best_other(torch.where(near, 1 - bearing.abs() / 180, 0.0))]
+    return torch.stack(parts, -1)
 
 
 def _best_other(value: Tensor) -> Tensor:

@@ -25,6 +25,7 @@ from rhmc.types import Batch, Frozen, Obs, Spec, State
 class Settings(Frozen):
     """The block `coordinator`; gamma, gae_lambda, ent_coef and n_steps are the source's."""
 
+    lr: float | None = Field(None, gt=0, description="Adam's step size at this level instead of the method's")
     gamma: float = Field(0.9, ge=0, le=1, description="per assignment period")
     gae_lambda: float = Field(1.0, ge=0, le=1, description="lambda of the advantages")
     standardise: Scale = Field("return", description="as `standardise` of other methods")
@@ -100,8 +101,9 @@ class Coordinator:
         self.cfg, self.period, self.rng = cfg.coordinator, cfg.assignment_period, rng
         sizes = Sizes.of(spec)
         actor, critic = (net(cfg.encoder, sizes, cfg.hidden_dim).to(rng.device) for net in (Assigner, Contributions))
-        self.actor = Learner(actor, lr=cfg.lr, tau=0.0, max_grad_norm=cfg.max_grad_norm)
-        self.critic = Learner(critic, lr=cfg.lr, tau=0.0, max_grad_norm=cfg.max_grad_norm)
+        lr = self.cfg.lr or cfg.lr
+        self.actor = Learner(actor, lr=lr, tau=0.0, max_grad_norm=cfg.max_grad_norm)
+        self.critic = Learner(critic, lr=lr, tau=0.0, max_grad_norm=cfg.max_grad_norm)
         self.standardiser = Standardiser(self.cfg.standardise, rng.device)
 
     def assign(self, obs: Obs, rng: Generator, *, explore: bool) -> tuple[Tensor, Tensor]:

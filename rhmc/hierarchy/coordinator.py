@@ -28,6 +28,7 @@ class Settings(Frozen):
     reward: Literal["assigned", "team"] = Field(
         "assigned", description="reward of the coordinator: Eq. 6, or the team's reward, which knows no regulation"
     )
+    lr: float | None = Field(None, gt=0, description="Adam's step size at this level instead of the method's")
     gamma: float = Field(0.99, ge=0, le=1, description="per assignment period")
     standardise: Scale = Field("none", description="as `standardise` of other methods")
     ent_coef: float = Field(0.2, ge=0, description="weight of the assignment's entropy, for advantages of deviation 1")
@@ -37,7 +38,7 @@ class Settings(Frozen):
 
 
 class Config(TargetNetworks):
-    """Settings of a method with this coordinator; lr is the paper's."""
+    """Settings of a method with this coordinator; lr is the paper's, for both levels."""
 
     coordinator: Settings = Settings()
 
@@ -51,8 +52,9 @@ class Coordinator:
         encoder = ENCODERS[cfg.encoder]
         actor = encoder.pairs(Sizes.of(spec), cfg.hidden_dim, 1).to(rng.device)
         critic = encoder.pairs(Sizes.of(spec, pair=1), cfg.hidden_dim, 1).to(rng.device)
-        self.actor = Learner(actor, lr=cfg.lr, tau=cfg.tau, max_grad_norm=cfg.max_grad_norm)
-        self.critic = Learner(critic, lr=cfg.lr, tau=cfg.tau, max_grad_norm=cfg.max_grad_norm)
+        lr = self.cfg.lr or cfg.lr
+        self.actor = Learner(actor, lr=lr, tau=cfg.tau, max_grad_norm=cfg.max_grad_norm)
+        self.critic = Learner(critic, lr=lr, tau=cfg.tau, max_grad_norm=cfg.max_grad_norm)
         self.standardiser = Standardiser(self.cfg.standardise, rng.device)
 
     def assign(self, obs: Obs, rng: Generator, *, explore: bool) -> Tensor:
@@ -63,13 +65,17 @@ class Coordinator:
         return (logits > 0).float()
 
     def update(self, rows: Batch) -> Batch:
-        """One step of the critic (Eq. 7) and one of the actor (Eq. 9)."""
+        """One step of the critic (Eq. 7) and one of the actor (Eq. 9).
+
+        The value after a period that an episode's end shortened is discounted by the period's `share` of a whole one.
+        """
         obs, after = unpack(rows), unpack(rows, "next_")
         with torch.no_grad():
             best = (self.actor.target_net(after).squeeze(-1) > 0).float()
             live = (~rows["terminated"]).float()
             value = self.standardiser.value(assignment_value(self.critic.target_net, after, best))
-            td_target = self.standardiser.reward(rows["reward"]) + self.cfg.gamma * live * value
+            discount = self.cfg.gamma ** rows["share"] * live
+            td_target = self.standardiser.reward(rows["reward"]) + discount * value
             self.standardiser.update_returns(td_target)
         q = assignment_value(self.critic.net, obs, rows["assignment"])
         td = mse_loss(q, self.standardiser.target(td_target))

@@ -1,8 +1,8 @@
 """The low level: shared actor and central critic that act under an assignment (section 4.3, Eq. 10 to 13).
 
-The actor sees its own (filtered) row and its assignment; the critic sees everything, every assignment and the other
-agents' actions, and has one output per own action. The bootstrap keeps the assignment that was acted under, so that the
-executors' task does not change with the coordinator.
+The actor sees its own (filtered) row and its assignment; the critic sees everything, the other agents' actions and, by
+`critic_sees`, every assignment, and has one output per own action. The bootstrap keeps the assignment that was acted
+under, so that the executors' task does not change with the coordinator.
 """
 
 from collections.abc import Callable
@@ -35,6 +35,13 @@ class Settings(Frozen):
     reward: Literal["local", "team"] = Field(
         "local", description="reward of the executors: their scores on assigned targets, or the team's reward"
     )
+    told: Literal["always", "filtered"] = Field(
+        "always", description="an executor is told its assignment: always, or where the filter is on, and else nothing"
+    )
+    critic_sees: Literal["all", "none"] = Field(
+        "all", description="assignments that the critic is told, or QMIX's mixture: all of them; or none, as in Q(x, a)"
+    )
+    lr: float | None = Field(None, gt=0, description="Adam's step size at this level instead of the method's")
     gamma: float = Field(0.99, ge=0, le=1)
     standardise: Scale = Field("none", description="as `standardise` of other methods")
     epsilon: float = Field(0.05, ge=0, le=1, description="share of actions drawn at random while exploring")
@@ -54,20 +61,22 @@ class Executor:
 
     def __init__(self, cfg: Config, spec: Spec, rng: Generator) -> None:
         self.cfg, self.actions = cfg.executor, spec.actions
-        self.filter, self.reward_fn = cfg.filter, REWARDS[self.cfg.reward]
+        self.reward_fn = REWARDS[self.cfg.reward]
+        self.actor_obs, self.critic_obs = partial(actor_obs, cfg), partial(critic_obs, cfg)
         policies = {"gumbel": partial(straight_through, rng=rng), "expected": partial(torch.softmax, dim=-1)}
         self.policy: Callable[[Tensor], Tensor] = policies[self.cfg.method]
         encoder, sizes = ENCODERS[cfg.encoder], Sizes.of(spec, pair=1)
         local = partial(encoder.local, sizes, cfg.hidden_dim, spec.actions)
         central = partial(encoder.central, sizes, cfg.hidden_dim, spec.actions, joint=spec.actions)
         actor, critic = (team(make, spec.agents, share=cfg.share).to(rng.device) for make in (local, central))
-        self.actor = Learner(actor, lr=cfg.lr, tau=cfg.tau, max_grad_norm=cfg.max_grad_norm)
-        self.critic = Learner(critic, lr=cfg.lr, tau=cfg.tau, max_grad_norm=cfg.max_grad_norm)
+        lr = self.cfg.lr or cfg.lr
+        self.actor = Learner(actor, lr=lr, tau=cfg.tau, max_grad_norm=cfg.max_grad_norm)
+        self.critic = Learner(critic, lr=lr, tau=cfg.tau, max_grad_norm=cfg.max_grad_norm)
         self.standardiser = Standardiser(self.cfg.standardise, rng.device)
 
     def act(self, obs: Obs, assignment: Tensor, rng: Generator, *, explore: bool) -> Tensor:
         """Actions (B, N) int64: sampled from the softened policy, or its greatest logit."""
-        logits = self.actor.net(filtered_obs(self.filter, obs, assignment))
+        logits = self.actor.net(self.actor_obs(obs, assignment))
         if explore:
             logits = mix(logits.softmax(-1), 1 / self.actions, self.cfg.epsilon).log() + gumbel(logits.shape, rng)
         return logits.argmax(-1)
@@ -81,12 +90,12 @@ class Executor:
     def update(self, rows: Batch) -> Batch:
         """One step of the critic (Eq. 11) and one of the actor (Eq. 13, ascent)."""
         g, obs, joint = rows["assignment"], unpack(rows), self._one_hot(rows["action"])
-        q = self.critic.net(with_assignment(obs, g), joint=joint)
+        q = self.critic.net(self.critic_obs(obs, g), joint=joint)
         chosen = taken(q, rows["action"])
         td_target = self._target(rows)
         self.standardiser.update_returns(td_target)
         td = mse_loss(chosen, self.standardiser.target(td_target))
-        logits = self.actor.net(filtered_obs(self.filter, obs, g))
+        logits = self.actor.net(self.actor_obs(obs, g))
         gain = (q.detach() * self.policy(logits)).sum(-1).mean()
         self.critic.update(td)
         self.actor.update(self.cfg.logit_penalty * logits.square().mean() - gain)
@@ -96,10 +105,9 @@ class Executor:
     @torch.no_grad()
     def _target(self, rows: Batch) -> Tensor:
         g, after = rows["assignment"], unpack(rows, "next_")
-        best = self.actor.target_net(filtered_obs(self.filter, after, g)).argmax(-1)
-        value = self.standardiser.value(
-            taken(self.critic.target_net(with_assignment(after, g), joint=self._one_hot(best)), best)
-        )
+        best = self.actor.target_net(self.actor_obs(after, g)).argmax(-1)
+        q = self.critic.target_net(self.critic_obs(after, g), joint=self._one_hot(best))
+        value = self.standardiser.value(taken(q, best))
         return self.standardiser.reward(rows["reward"]) + self.cfg.gamma * (~rows["terminated"]).unsqueeze(-1) * value
 
     def _one_hot(self, action: Tensor) -> Tensor:
@@ -121,14 +129,20 @@ class Executor:
         checkpoint.load_parts(state, self._parts())
 
 
-def with_assignment(obs: Obs, assignment: Tensor) -> Obs:
-    """The observation with the assignment as the last feature of every pair."""
-    return append(obs, pair=assignment.unsqueeze(-1))
+def with_assignment(obs: Obs, assignment: Tensor, *, told: bool = True) -> Obs:
+    """The observation with the assignment as the last feature of every pair, or 0 there if it is not `told`."""
+    return append(obs, pair=(assignment if told else torch.zeros_like(assignment)).unsqueeze(-1))
 
 
-def filtered_obs(name: str, obs: Obs, assignment: Tensor) -> Obs:
-    """The observation of an executor: filtered by the filter `name` (Eq. 10), with the assignment."""
-    return with_assignment(obs._replace(pairs=FILTERS[name](obs.pairs, assignment)), assignment)
+def actor_obs(cfg: Config, obs: Obs, assignment: Tensor) -> Obs:
+    """The observation of an executor: filtered (Eq. 10), with the assignment or, untold without the filter, zeros."""
+    seen = obs._replace(pairs=FILTERS[cfg.filter](obs.pairs, assignment))
+    return with_assignment(seen, assignment, told=cfg.filter == "on" or cfg.executor.told == "always")
+
+
+def critic_obs(cfg: Config, obs: Obs, assignment: Tensor) -> Obs:
+    """The observation of a critic: everything, with every assignment or none (Eq. 11 has Q(x, a))."""
+    return with_assignment(obs, assignment, told=cfg.executor.critic_sees == "all")
 
 
 def _local(t: Transition, assignment: Tensor) -> Tensor:

@@ -1,16 +1,16 @@
 """Executors that act greedily on their own action values, learned together through QMIX's monotone mixture.
 
 An alternative to the actors of `rhmc.hierarchy.executor` (Eq. 10 to 13), with the same observations and rewards.
-Each executor values its actions from its filtered row and its assignment. The mixture's weights come from all
-observations and all assignments, as in Rashid et al. 2018. The mixture is one value, so its reward is the mean of the
-executors' rewards.
+Each executor values its actions from its filtered row and its assignment. The mixture stands where the critic does: its
+weights come from all observations and, by `critic_sees`, all assignments, as in Rashid et al. 2018. It is one value, so
+its reward is the mean of the executors' rewards.
 """
 
 import torch
 from torch import Generator, Tensor, nn
 from torch.nn.functional import mse_loss
 
-from rhmc.hierarchy.executor import REWARDS, Config, filtered_obs, with_assignment
+from rhmc.hierarchy.executor import REWARDS, Config, actor_obs, critic_obs
 from rhmc.learning import checkpoint
 from rhmc.learning.learner import Learner, Learners, pack_step, taken, unpack
 from rhmc.learning.normalisation import Standardiser
@@ -25,17 +25,18 @@ class Values(nn.Module):
 
     def __init__(self, cfg: Config, spec: Spec) -> None:
         super().__init__()
-        self.filter, encoder, sizes = cfg.filter, ENCODERS[cfg.encoder], Sizes.of(spec, pair=1)
+        self.cfg, encoder, sizes = cfg, ENCODERS[cfg.encoder], Sizes.of(spec, pair=1)
         self.own = team(lambda: encoder.local(sizes, cfg.hidden_dim, spec.actions), spec.agents, share=cfg.share)
         self.mixer = encoder.mixer(sizes, cfg.hidden_dim, MIXING_EMBED_DIM)
 
     def forward(self, obs: Obs, assignment: Tensor) -> Tensor:
         """Values (B, N, actions)."""
-        return self.own(filtered_obs(self.filter, obs, assignment))
+        return self.own(actor_obs(self.cfg, obs, assignment))
 
     def mixed(self, obs: Obs, assignment: Tensor, action: Tensor) -> Tensor:
         """Value (B,) of a joint action (B, N)."""
-        return self.mixer(with_assignment(obs, assignment), taken(self(obs, assignment), action)).squeeze(-1)
+        own = taken(self(obs, assignment), action)
+        return self.mixer(critic_obs(self.cfg, obs, assignment), own).squeeze(-1)
 
 
 class QMIXExecutor:
@@ -44,7 +45,8 @@ class QMIXExecutor:
     def __init__(self, cfg: Config, spec: Spec, rng: Generator) -> None:
         self.cfg, self.actions = cfg.executor, spec.actions
         self.reward_fn = REWARDS[self.cfg.reward]
-        self.q = Learner(Values(cfg, spec).to(rng.device), lr=cfg.lr, tau=cfg.tau, max_grad_norm=cfg.max_grad_norm)
+        values, lr = Values(cfg, spec).to(rng.device), self.cfg.lr or cfg.lr
+        self.q = Learner(values, lr=lr, tau=cfg.tau, max_grad_norm=cfg.max_grad_norm)
         self.standardiser = Standardiser(self.cfg.standardise, rng.device)
 
     def act(self, obs: Obs, assignment: Tensor, rng: Generator, *, explore: bool) -> Tensor:

@@ -6,20 +6,28 @@ Only the targets assigned to an agent count for it ("the states of assigned targ
 
 Readings of the text where it is silent or slips:
 - Eq. 6: p_j is 1 where an agent assigned to j completes it, q_j where j is assigned and not completed; a target
-  assigned to nobody counts nothing.
+  assigned to nobody counts nothing or, with `unassigned: charged`, as one that is not completed.
 - Algorithm 1, line 11: dp[i][j] = dp[i-1][k] OR mask. Line 17: the maximum goes over the options of the last agent.
 - The maximum with the executed reward is the caller's: `torch.maximum(executed(...), REGULATORS[name](...))`.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
-Regulator = Callable[[Tensor, Tensor, float], Tensor]
-
 MOST_TARGETS = 12  # the exact table has 2^M entries per environment
+
+
+class Charges(NamedTuple):
+    """The penalties of Eq. 6: alpha_1, in [0, 1], and whether it is also due for a target assigned to nobody."""
+
+    alpha: float
+    unassigned: Literal["free", "charged"] = "free"
+
+
+Regulator = Callable[[Tensor, Tensor, Charges], Tensor]
 
 
 class Path(NamedTuple):
@@ -30,61 +38,61 @@ class Path(NamedTuple):
     reward: float  # Eq. 6
 
 
-def high_level_reward(completed: Tensor, assignment: Tensor, alpha: float) -> Tensor:
-    """Eq. 6: the sum over assigned targets of 1/k_j where completed and -alpha where not; k_j agents are assigned to j.
+def high_level_reward(completed: Tensor, assignment: Tensor, charges: Charges) -> Tensor:
+    """Eq. 6: the sum over targets of 1/k_j where completed and -alpha where not; k_j agents are assigned to j.
 
     Args:
         completed: (B, M) bool, by an agent assigned to it.
         assignment: (B, N, M).
-        alpha: penalty of an assigned target that is not completed, in [0, 1].
+        charges: for targets that are not completed.
 
     Returns:
         (B,) float32.
     """
-    return _reward(completed, (assignment > 0.5).sum(1), alpha)
+    return _reward(completed, (assignment > 0.5).sum(1), charges)
 
 
-def executed(completed: Tensor, assignment: Tensor, alpha: float) -> Tensor:
+def executed(completed: Tensor, assignment: Tensor, charges: Charges) -> Tensor:
     """Eq. 6 as earned: a target is completed where at least one agent assigned to it completes it.
 
     Args:
         completed: (B, N, M) bool, agent i completes target j (`Step.completed`).
         assignment: (B, N, M).
-        alpha: as in `high_level_reward`.
+        charges: as in `high_level_reward`.
 
     Returns:
         (B,) float32.
     """
-    return high_level_reward((completed & (assignment > 0.5)).any(1), assignment, alpha)
+    return high_level_reward((completed & (assignment > 0.5)).any(1), assignment, charges)
 
 
-def none(options: Tensor, assignment: Tensor, alpha: float) -> Tensor:
+def none(options: Tensor, assignment: Tensor, charges: Charges) -> Tensor:
     """No regulation: minus infinity, so that the maximum with the executed reward is the executed reward. (B,)."""
     return torch.full(options.shape[:1], -torch.inf, device=options.device)
 
 
-def paper(options: Tensor, assignment: Tensor, alpha: float) -> Tensor:
+def paper(options: Tensor, assignment: Tensor, charges: Charges) -> Tensor:
     """Algorithm 1 as printed. It can fall short of the optimum (`rhmc.hierarchy.theorem`).
 
     Args:
         options: (B, N, D, M) bool.
         assignment: (B, N, M).
-        alpha: as in `high_level_reward`.
+        charges: as in `high_level_reward`.
 
     Returns:
         (B,) float32, the largest reward among the masks of the last agent.
     """
     masks, _ = _most_targets(_assigned(options, assignment))
-    return _reward(masks, (assignment > 0.5).sum(1, keepdim=True), alpha).amax(-1)
+    return _reward(masks, (assignment > 0.5).sum(1, keepdim=True), charges).amax(-1)
 
 
-def exact(options: Tensor, assignment: Tensor, alpha: float) -> Tensor:
+def exact(options: Tensor, assignment: Tensor, charges: Charges) -> Tensor:
     """The largest Eq. 6 reward over all D^N joint options, in N M 2^M operations per environment.
 
     Args:
         options: (B, N, D, M) bool.
         assignment: (B, N, M).
-        alpha: as in `high_level_reward`.
+        charges: as in `high_level_reward`.
 
     Returns:
         (B,) float32.
@@ -93,16 +101,16 @@ def exact(options: Tensor, assignment: Tensor, alpha: float) -> Tensor:
         ValueError: more than `MOST_TARGETS` targets.
     """
     tables = _reachable(_assigned(options, assignment))
-    return high_level_reward(_best_subset(tables[-1], assignment, alpha), assignment, alpha)
+    return high_level_reward(_best_subset(tables[-1], assignment, charges.alpha), assignment, charges)
 
 
 REGULATORS: dict[str, Regulator] = {"none": none, "paper": paper, "exact": exact}
 
 
-def algorithm1_path(options: Tensor, assignment: Tensor, alpha: float) -> Path:
+def algorithm1_path(options: Tensor, assignment: Tensor, charges: Charges) -> Path:
     """The joint option that Algorithm 1 settles on. options: (N, D, M) bool, assignment: (N, M), one instance."""
     masks, parents = _most_targets(_assigned(options, assignment).unsqueeze(0))
-    rewards = _reward(masks, (assignment > 0.5).sum(0), alpha)[0]
+    rewards = _reward(masks, (assignment > 0.5).sum(0), charges)[0]
     choices = [int(rewards.argmax())]
     completed = masks[0, choices[0]]
     for parent in reversed(parents):
@@ -110,7 +118,7 @@ def algorithm1_path(options: Tensor, assignment: Tensor, alpha: float) -> Path:
     return Path(tuple(reversed(choices)), tuple(completed.tolist()), float(rewards.amax()))
 
 
-def optimal_path(options: Tensor, assignment: Tensor, alpha: float) -> Path:
+def optimal_path(options: Tensor, assignment: Tensor, charges: Charges) -> Path:
     """A joint option of the largest reward. options: (N, D, M) bool, assignment: (N, M), one instance.
 
     Raises:
@@ -118,8 +126,8 @@ def optimal_path(options: Tensor, assignment: Tensor, alpha: float) -> Path:
     """
     held = _assigned(options, assignment)
     tables = _reachable(held.unsqueeze(0))
-    completed = _best_subset(tables[-1], assignment.unsqueeze(0), alpha)
-    reward = float(high_level_reward(completed, assignment.unsqueeze(0), alpha))
+    completed = _best_subset(tables[-1], assignment.unsqueeze(0), charges.alpha)
+    reward = float(high_level_reward(completed, assignment.unsqueeze(0), charges))
     subset, masks = int(_numbers(completed)), _numbers(held).tolist()
     choices = []
     for row, before in zip(masks[:0:-1], tables[-2::-1], strict=True):
@@ -135,10 +143,11 @@ def _assigned(options: Tensor, assignment: Tensor) -> Tensor:
     return options & (assignment > 0.5).unsqueeze(-2)
 
 
-def _reward(completed: Tensor, agents: Tensor, alpha: float) -> Tensor:
+def _reward(completed: Tensor, agents: Tensor, charges: Charges) -> Tensor:
     """Eq. 6 from the number of agents assigned to each target; both (..., M), broadcast."""
-    gain = torch.where(completed, 1 / agents.clamp(min=1), -alpha)
-    return (gain * (agents > 0)).sum(-1)
+    gain = torch.where(completed, 1 / agents.clamp(min=1), -charges.alpha)
+    counted = agents > 0 if charges.unassigned == "free" else (agents > 0) | ~completed
+    return (gain * counted).sum(-1)
 
 
 def _most_targets(options: Tensor) -> tuple[Tensor, list[Tensor]]:
@@ -200,7 +209,10 @@ def _exactly(table: Tensor) -> Tensor:
 
 
 def _best_subset(reachable: Tensor, assignment: Tensor, alpha: float) -> Tensor:
-    """The reachable set of the largest reward. reachable: (B, 2^M) bool. Returns (B, M) bool."""
+    """The reachable set of the largest reward. reachable: (B, 2^M) bool. Returns (B, M) bool.
+
+    What unassigned targets cost is the same for all sets.
+    """
     agents = (assignment > 0.5).sum(1)
     gain = torch.where(agents > 0, 1 / agents.clamp(min=1) + alpha, 0.0)
     members = _members(agents.shape[-1], reachable.device)

@@ -61,12 +61,17 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {  # beside the defaults, on b
             "coordinator.standardise": "return",
         },
     ),
+    "rhmc untold": (
+        "rhmc",
+        {"filter": "off", "executor.told": "filtered", "executor.critic_sees": "none", "unassigned": "charged"},
+    ),
     "rhmc scaled": ("rhmc", {"executor.standardise": "return", "coordinator.standardise": "reward"}),
     "rhmc period 3": ("rhmc", {"assignment_period": 3}),
     "rhmc period 3 counterfactual": (
         "rhmc",
         {"assignment_period": 3, "coordinator.gradient": "counterfactual", "regulator": "exact"},
     ),
+    "hitmac untold": ("hitmac", {"filter": "off", "executor.told": "filtered", "executor.critic_sees": "none"}),
     "hitmac period 3": ("hitmac", {"assignment_period": 3, "coordinator.n_steps": 2}),
     "mappo kl_adaptive": ("mappo", {"objective": "kl_adaptive"}),
     "coma critic": ("coma", {"advantage_estimator": "critic"}),
@@ -422,12 +427,13 @@ def test_greedy_acting_is_not_random_and_exploring_is_decided_by_the_generator(c
 
 EXTENDED: list[Any] = [
     coverage.Config(agents=4, targets=5, observation="extended"),
+    coverage.Config(agents=4, targets=5, observation="extended_own"),
     navigation.Config(agents=4, observation="extended", episode=EPISODE),
 ]
 
 
 @pytest.mark.parametrize("kind", ALGORITHMS)
-@pytest.mark.parametrize("cfg", EXTENDED, ids=lambda cfg: cfg.kind)
+@pytest.mark.parametrize("cfg", EXTENDED, ids=lambda cfg: f"{cfg.kind}-{cfg.observation}")
 def test_reordering_agents_reorders_what_they_do(kind: str, cfg: Any) -> None:
     env, obs = world(cfg, batch=30)
     order, lively = [2, 0, 3, 1], 0
@@ -447,7 +453,7 @@ def test_reordering_agents_reorders_what_they_do(kind: str, cfg: Any) -> None:
 
 
 @pytest.mark.parametrize("kind", ALGORITHMS)
-@pytest.mark.parametrize("cfg", EXTENDED, ids=lambda cfg: cfg.kind)
+@pytest.mark.parametrize("cfg", EXTENDED, ids=lambda cfg: f"{cfg.kind}-{cfg.observation}")
 def test_pairwise_weights_act_for_another_number_of_agents_and_targets(kind: str, cfg: Any) -> None:
     sizes = {"agents": 3, "targets": 2} if cfg.kind == "coverage" else {"agents": 3}
     algo = settle(kind, encoder="pairwise")

@@ -126,3 +126,8 @@ def extended_features(world: World, i: int, j: int) -> list[float]:
         float(any(world.sees(k, j) for k in others)),
         max((1 - abs(world.bearing(k, j)) / 180 for k in others if world.distance(k, j) <= 800), default=0.0),
     ]
+
+
+def extended_own_features(world: World, i: int, j: int) -> list[float]:
+    """The richer description as a sensor without any word of the others has it."""
+    return extended_features(World([world.sensors[i]], [world.headings[i]], world.targets), 0, j)[:8]

@@ -9,15 +9,15 @@ Assignment = list[list[bool]]
 Completed = list[bool]
 
 
-def reward(completed: Completed, assignment: Assignment, alpha: float) -> float:
-    """Eq. 6, term by term."""
+def reward(completed: Completed, assignment: Assignment, alpha: float, unassigned: str = "free") -> float:
+    """Eq. 6, term by term; targets assigned to nobody are left out (`free`), or pay like others (`charged`)."""
     total = 0.0
     for j, done in enumerate(completed):
         k = sum(row[j] for row in assignment)
-        if k == 0:
+        if k == 0 and unassigned == "free":
             continue
         p, q = int(done), int(not done)
-        total += p / k - alpha * q
+        total += (p / k if k else 0) - alpha * q
     return total
 
 
@@ -50,11 +50,11 @@ def algorithm1_masks(options: Options, assignment: Assignment) -> list[Completed
     return [[bool(mask >> t & 1) for t in range(m)] for mask in dp[n - 1]]
 
 
-def optimum(options: Options, assignment: Assignment, alpha: float) -> float:
+def optimum(options: Options, assignment: Assignment, alpha: float, unassigned: str = "free") -> float:
     """The best reward over every joint option."""
-    return max(reward(completed, assignment, alpha) for completed in joint_options(options, assignment))
+    return max(reward(completed, assignment, alpha, unassigned) for completed in joint_options(options, assignment))
 
 
-def algorithm1(options: Options, assignment: Assignment, alpha: float) -> float:
+def algorithm1(options: Options, assignment: Assignment, alpha: float, unassigned: str = "free") -> float:
     """Algorithm 1, lines 17 to 20."""
-    return max(reward(completed, assignment, alpha) for completed in algorithm1_masks(options, assignment))
+    return max(reward(completed, assignment, alpha, unassigned) for completed in algorithm1_masks(options, assignment))

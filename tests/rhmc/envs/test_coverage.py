@@ -20,6 +20,12 @@ from tests.support import seeded
 PRESETS = ("flat", "executor", "coordinator")
 WORLDS = 6  # rows in a comparison with the oracle
 
+FEATURES = {  # by observation
+    "paper": oracle.paper_features,
+    "extended": oracle.extended_features,
+    "extended_own": oracle.extended_own_features,
+}
+
 quick = settings(deadline=None, max_examples=15)
 seeds = st.integers(0, 2**31)
 presets = st.sampled_from(PRESETS)
@@ -190,15 +196,14 @@ def test_rewards_and_sight_are_the_oracles(
     assert torch.equal(out.completed.double(), per_pair(worlds, oracle.World.sees))
 
 
-@given(seeds, st.integers(1, 6), st.integers(1, 6), presets, st.integers(0, 3), st.sampled_from(("paper", "extended")))
+@given(seeds, st.integers(1, 6), st.integers(1, 6), presets, st.integers(0, 3), st.sampled_from(tuple(FEATURES)))
 @quick
 def test_observations_are_the_oracles(seed: int, n: int, m: int, preset: Any, steps: int, observation: Any) -> None:
     n = min(n, m)
     cfg = Config(preset=preset, agents=n, targets=m, observation=observation)
     state = played(cfg, WORLDS, seeded(seed), steps)
-    features = {"paper": oracle.paper_features, "extended": oracle.extended_features}[observation]
     obs = coverage.observe(cfg, double(state))
-    assert torch.allclose(obs.pairs.double(), per_pair(worlds_of(state), features), atol=2e-6)
+    assert torch.allclose(obs.pairs.double(), per_pair(worlds_of(state), FEATURES[observation]), atol=2e-6)
     assert obs.pairs.shape == (WORLDS, n, m, coverage.spec(cfg).pair_features)
     assert (obs.agents.shape, obs.peers.shape) == ((WORLDS, n, 0), (WORLDS, n, n, 0))
     assert obs.first.tolist() == [steps == 0] * WORLDS
@@ -243,6 +248,20 @@ def test_extended_features_of_a_known_scene() -> None:
         [half, half, 0.25, 0.3 * half, half, -half, 0, 1, 1, 1 - 35 / 180], abs=1e-6
     )  # turns clockwise, to the sensor's left edge; the other one sees it 35 degrees off its axis
     assert second[6:].tolist() == pytest.approx([1, 1, 0, 1 - 45 / 180], abs=1e-6)
+
+
+@pytest.mark.parametrize("observation", FEATURES)
+def test_what_an_observation_tells_of_other_sensors(observation: Any) -> None:
+    """Nothing, but for the last two features of `extended`, which `extended_own` leaves out."""
+    cfg = Config(observation=observation)
+    state = played(cfg, 50, seeded(0), 3)
+    turned = state._replace(heading=torch.cat((state.heading[:, :1], coverage.wrap(state.heading[:, 1:] + 90)), 1))
+    before, after = (coverage.observe(cfg, one).pairs[:, 0] for one in (state, turned))
+    same = (before == after).flatten(0, 1).all(0).tolist()
+    assert same == [True] * 8 + [False] * 2 if observation == "extended" else all(same)
+    whole = coverage.observe(Config(observation="extended"), state).pairs
+    if observation == "extended_own":
+        assert torch.equal(coverage.observe(cfg, state).pairs, whole[..., :8])
 
 
 @pytest.mark.parametrize(

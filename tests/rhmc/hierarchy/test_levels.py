@@ -8,13 +8,14 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from rhmc.algorithms import ALGORITHMS
 from rhmc.algorithms.rhmc import RHMC, Config
 from rhmc.envs import coverage, make_env, navigation
 from rhmc.envs.base import Env
 from rhmc.hierarchy.coordinator import Coordinator, assignment_value, differences
 from rhmc.hierarchy.executor import Executor
-from rhmc.hierarchy.regulation import REGULATORS
-from rhmc.learning.learner import Learner
+from rhmc.hierarchy.regulation import REGULATORS, Charges
+from rhmc.learning.learner import Learner, unpack
 from rhmc.learning.normalisation import KEPT
 from rhmc.networks.nets import ENCODERS, PairNet, Sizes, append
 from rhmc.types import Batch, Obs, Spec, Transition, assigned_reward
@@ -36,7 +37,8 @@ def rows(batch: int = 1, terminated: bool = False, **changes: Tensor) -> Batch:
     """The columns that both levels may be given; rewards are added by the test."""
     held = (torch.rand(batch, N, M) < 0.5).float()
     some = observed(SPEC, batch)
-    return some | {"assignment": held, "terminated": torch.full((batch,), terminated)} | changes
+    whole = {"terminated": torch.full((batch,), terminated), "share": torch.ones(batch)}
+    return some | {"assignment": held} | whole | changes
 
 
 def outputs(net: nn.Module, call: Any) -> list[Tensor]:
@@ -47,6 +49,21 @@ def outputs(net: nn.Module, call: Any) -> list[Tensor]:
     handle.remove()
     assert seen
     return seen
+
+
+# Step sizes
+
+
+@pytest.mark.parametrize(("kind", "method"), [("rhmc", "gumbel"), ("rhmc", "qmix"), ("hitmac", "expected")])
+def test_a_level_may_have_a_step_size_of_its_own(kind: str, method: str) -> None:
+    sizes: list[dict[str, Any]] = [{}, {"executor.lr": 2e-3}, {"coordinator.lr": 3e-3}]
+    for own in [*sizes, sizes[1] | sizes[2]]:
+        cfg = ALGORITHMS[kind].config(**nested({"lr": 1e-3, "executor.method": method} | own))
+        algo: Any = ALGORITHMS[kind].build(cfg, SPEC, 4, seeded())
+        for name in ("executor", "coordinator"):
+            learners = getattr(algo, name).learners()
+            steps = {group["lr"] for learner in learners for group in learner.optimiser.param_groups}
+            assert steps == {learner.lr for learner in learners} == {own.get(f"{name}.lr", 1e-3)}
 
 
 # Executor
@@ -152,6 +169,46 @@ def test_an_executor_knows_which_targets_are_its_own(mode: str) -> None:
 
 
 @pytest.mark.parametrize("encoder", ["mlp", "pairwise"])
+@pytest.mark.parametrize("mode", ["on", "off"])
+def test_without_the_filter_an_executor_may_be_told_nothing(encoder: str, mode: str) -> None:
+    """Acting and in both passes of its actor while learning; where the filter is on that changes nothing."""
+    data = rows(40, reward=torch.zeros(40, N), action=torch.zeros(40, N, dtype=torch.int64))
+
+    def seen(held: Tensor, **changes: Any) -> list[Tensor]:
+        torch.manual_seed(0)
+        low = Executor(config(encoder=encoder, filter=mode, lr=1e-9, tau=0.0, **changes), SPEC, seeded())
+        given = data | {"assignment": held}
+        acting = outputs(low.actor.net, lambda: low.act(unpack(given), held, seeded(), explore=False))
+        learning = [outputs(net, lambda: low.update(given)) for net in (low.actor.net, low.actor.target_net)]
+        return acting + [out for found in learning for out in found]
+
+    held, nothing = data["assignment"], torch.zeros(40, N, M)
+    told, untold = seen(held), seen(held, executor__told="filtered")
+    assert len(told) == len(untold) == 3
+    for a, b, c in zip(told, untold, seen(nothing), strict=True):
+        assert torch.equal(b, a if mode == "on" else c)
+        assert not torch.allclose(a, c, atol=1e-3)
+
+
+@pytest.mark.parametrize("encoder", ["mlp", "pairwise"])
+def test_what_the_critic_is_told_of_the_assignment(encoder: str) -> None:
+    """All of it, now and in the bootstrap; with `none` neither, as if it were always nothing."""
+    data = rows(40, reward=torch.zeros(40, N), action=torch.zeros(40, N, dtype=torch.int64))
+
+    def judged(held: Tensor, net: str, **changes: Any) -> Tensor:
+        torch.manual_seed(0)
+        low = Executor(config(encoder=encoder, **changes), SPEC, seeded())
+        constant(low.actor.target_net, [0.0, 3.0, 1.0])
+        (found,) = outputs(getattr(low.critic, net), lambda: low.update(data | {"assignment": held}))
+        return found
+
+    every, nothing = torch.ones(40, N, M), torch.zeros(40, N, M)
+    for net in ("net", "target_net"):
+        assert not torch.allclose(judged(every, net), judged(nothing, net), atol=1e-3)
+        assert torch.equal(judged(every, net, executor__critic_sees="none"), judged(nothing, net))
+
+
+@pytest.mark.parametrize("encoder", ["mlp", "pairwise"])
 def test_the_slow_copies_and_the_other_network_of_a_level_are_left_alone(encoder: str) -> None:
     """Each optimiser moves its own network only: with a step of zero for one, only the other moves."""
     low, high = Executor(config(encoder=encoder), SPEC, seeded()), Coordinator(config(encoder=encoder), SPEC, seeded())
@@ -181,14 +238,24 @@ def _values(learner: Learner) -> list[Tensor]:
 @pytest.mark.parametrize("gradient", ["ddpg", "counterfactual"])
 @pytest.mark.parametrize("encoder", ["mlp", "pairwise"])
 @pytest.mark.parametrize("terminated", [False, True])
-def test_coordinator_target_by_hand(gradient: str, encoder: str, terminated: bool) -> None:
-    """The critic is a sum over the six pairs: 6 x 0.5 now, 6 x 2 later."""
+@pytest.mark.parametrize(("share", "discount"), [(1.0, 0.25), (0.5, 0.5)])
+def test_coordinator_target_by_hand(
+    gradient: str, encoder: str, terminated: bool, share: float, discount: float
+) -> None:
+    """The critic is a sum over the six pairs: 6 x 0.5 now, 6 x 2 later. Half a period has the root of the discount."""
     high = Coordinator(config(encoder=encoder, coordinator__gradient=gradient), SPEC, seeded())
     constant(high.critic.net, [0.5])
     constant(high.critic.target_net, [2.0])
-    logs = high.update(rows(terminated=terminated, reward=torch.tensor([0.75]), earned=torch.tensor([0.0])))
-    target = 0.75 if terminated else 0.75 + 0.25 * N * M * 2
+    pay = {"reward": torch.tensor([0.75]), "earned": torch.tensor([0.0])}
+    logs = high.update(rows(terminated=terminated, share=torch.tensor([share]), **pay))
+    target = 0.75 if terminated else 0.75 + discount * N * M * 2
     assert logs["high_td"].item() == pytest.approx((N * M * 0.5 - target) ** 2)
+
+
+def test_a_whole_period_has_the_discount_to_the_last_bit() -> None:
+    """So that nothing depends on the power where periods divide an episode."""
+    gammas = torch.linspace(0, 1, 5001, dtype=torch.float64).tolist()
+    assert all((gamma ** torch.ones(9) == torch.tensor(gamma)).all() for gamma in gammas)
 
 
 def test_coordinator_standardises_rewards_or_returns_by_those_seen() -> None:
@@ -393,24 +460,28 @@ def begin(world: str, batch: int, **changes: Any) -> tuple[RHMC, Env]:
 @pytest.mark.parametrize("world", WORLDS)
 @pytest.mark.parametrize("regulator", REGULATORS)
 @pytest.mark.parametrize("period", [1, 3])
-def test_high_rows_are_those_of_the_periods_worked_out_one_by_one(world: str, regulator: str, period: int) -> None:
+@pytest.mark.parametrize("unassigned", ["free", "charged"])
+def test_high_rows_are_those_of_the_periods_worked_out_one_by_one(
+    world: str, regulator: str, period: int, unassigned: Any
+) -> None:
     """Each period: from the observation it was drawn in, max(mean of Eq. 6 earned, bound when drawn), to its last one.
 
     An episode of 7 steps cuts a period of 3 short: 3 + 3 + 1.
     """
-    alpha = 0.3
-    algo, env = begin(world, 24, regulator=regulator, assignment_period=period, alpha=alpha, buffer_size=900)
+    charges = Charges(0.3, unassigned)
+    changes = {"regulator": regulator, "assignment_period": period, **charges._asdict()}
+    algo, env = begin(world, 24, buffer_size=900, **changes)
     expected: list[dict[str, Any]] = []
     periods: list[dict[str, Any]] = [{} for _ in range(24)]
     for step, (t, table, _) in enumerate(play(algo, env, 17)):
         held, at = t.extra["assignment"], step % 7 % period
         for k in range(24):
             if at == 0:
-                bound = _bound(regulator, table[k], held[k], alpha)
+                bound = _bound(regulator, table[k], held[k], charges)
                 periods[k] = {"pairs": t.obs.pairs[k], "held": held[k], "earned": [], "bound": bound}
             assert torch.equal(held[k], periods[k]["held"])
             done = (t.completed[k] & held[k].bool()).any(0).tolist()
-            periods[k]["earned"].append(oracle.reward(done, held[k].int().tolist(), alpha))
+            periods[k]["earned"].append(oracle.reward(done, held[k].int().tolist(), *charges))
             if at == period - 1 or step % 7 == 6:
                 expected.append(periods[k] | {"next": t.next_obs.pairs[k]})
     stored = algo.state_dict()["high"]["rows"]
@@ -419,6 +490,7 @@ def test_high_rows_are_those_of_the_periods_worked_out_one_by_one(world: str, re
         earned = sum(period_["earned"]) / len(period_["earned"])
         assert stored["earned"][k].item() == pytest.approx(earned, abs=1e-6)
         assert stored["reward"][k].item() == pytest.approx(max(earned, period_["bound"]), abs=1e-6)
+        assert stored["share"][k].item() == pytest.approx(len(period_["earned"]) / period)
         assert torch.equal(stored["assignment"][k], period_["held"])
         assert torch.equal(stored["pairs"][k], period_["pairs"])
         assert torch.equal(stored["next_pairs"][k], period_["next"])
@@ -428,13 +500,13 @@ def test_high_rows_are_those_of_the_periods_worked_out_one_by_one(world: str, re
         assert (stored["reward"] > stored["earned"]).any()
 
 
-def _bound(regulator: str, options: Tensor, held: Tensor, alpha: float) -> float:
+def _bound(regulator: str, options: Tensor, held: Tensor, charges: Charges) -> float:
     """By the slow oracles: every joint option, or Algorithm 1 line by line."""
     if regulator == "none":
         return -float("inf")
     slow = {"paper": oracle.algorithm1, "exact": oracle.optimum}[regulator]
     masked = (options & held.bool().unsqueeze(1)).tolist()
-    return slow(masked, held.int().tolist(), alpha)
+    return slow(masked, held.int().tolist(), *charges)
 
 
 def test_low_rows_are_every_step_under_the_assignment_held() -> None:

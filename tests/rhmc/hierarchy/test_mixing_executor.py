@@ -94,6 +94,26 @@ def test_own_values_and_the_mixture_know_the_assignment() -> None:
     assert not torch.allclose(*(low.q.net.mixed(obs, g, data["action"]) for g in (none, all_)))
 
 
+@pytest.mark.parametrize("mode", ["on", "off"])
+def test_own_values_may_know_nothing_of_the_assignment_without_the_filter(mode: str) -> None:
+    low, data = executor(encoder="pairwise", filter=mode, executor__told="filtered"), rows(5)
+    obs = Obs(data["agents"], data["pairs"], data["peers"], None)
+    none, all_ = torch.zeros(5, N, M), torch.ones(5, N, M)
+    assert torch.equal(low.q.net(obs, none), low.q.net(obs, all_)) == (mode == "off")
+    low.q.net.own = Known(NET)
+    assert not torch.allclose(*(low.q.net.mixed(obs, g, data["action"]) for g in (none, all_)))
+
+
+@pytest.mark.parametrize("encoder", ["mlp", "pairwise"])
+def test_the_mixture_may_know_nothing_of_the_assignment(encoder: str) -> None:
+    low, data = executor(encoder=encoder, executor__critic_sees="none"), rows(5)
+    obs = Obs(data["agents"], data["pairs"], data["peers"], None)
+    none, all_ = torch.zeros(5, N, M), torch.ones(5, N, M)
+    assert not torch.allclose(low.q.net(obs, none), low.q.net(obs, all_))
+    low.q.net.own = Known(NET)
+    assert torch.equal(*(low.q.net.mixed(obs, g, data["action"]) for g in (none, all_)))
+
+
 def test_explores_by_a_share_of_random_actions() -> None:
     low = known(executor__epsilon=0.3)
     obs = Obs(torch.zeros(9000, N, 1), torch.zeros(9000, N, M, 4), torch.zeros(9000, N, N, 0), None)

@@ -13,6 +13,7 @@ from torch import Tensor
 from rhmc.hierarchy.regulation import (
     MOST_TARGETS,
     REGULATORS,
+    Charges,
     algorithm1_path,
     executed,
     high_level_reward,
@@ -22,24 +23,24 @@ from rhmc.hierarchy.theorem import CROWDED, random_instances, shortfall_table, s
 from tests.oracles import regulation as oracle
 
 B = 5  # instances per drawn shape
-Drawn = tuple[Tensor, Tensor, float]  # options, assignment, alpha
-alphas = st.sampled_from([0.0, 0.1, 0.5, 1.0])
+Drawn = tuple[Tensor, Tensor, Charges]  # options, assignment, penalties
+penalties = st.builds(Charges, st.sampled_from([0.0, 0.1, 0.5, 1.0]), st.sampled_from(["free", "charged"]))
 
 
 @st.composite
 def batches(draw: st.DrawFn, agents: int = 4, options: int = 4, targets: int = 5) -> Drawn:
-    """Options (B, N, D, M), assignment (B, N, M) and alpha, from every density including none and all."""
+    """Options (B, N, D, M), assignment (B, N, M) and penalties, from every density including none and all."""
     n, d, m = (draw(st.integers(1, most)) for most in (agents, options, targets))
     density = st.sampled_from([0.0, 0.2, 0.35, 0.5, 0.8, 1.0])
     rng = torch.Generator().manual_seed(draw(st.integers(0, 2**31)))
     table = torch.rand(B, n, d, m, generator=rng) < draw(density)
-    return table, torch.rand(B, n, m, generator=rng) < draw(density), draw(alphas)
+    return table, torch.rand(B, n, m, generator=rng) < draw(density), draw(penalties)
 
 
-def apply(function: Callable[..., float], options: Tensor, assignment: Tensor, alpha: float) -> Tensor:
+def apply(function: Callable[..., float], options: Tensor, assignment: Tensor, charges: Charges) -> Tensor:
     """An oracle on each instance."""
     rows = zip(options.tolist(), assignment.tolist(), strict=True)
-    return torch.tensor([function(*row, alpha) for row in rows])
+    return torch.tensor([function(*row, *charges) for row in rows])
 
 
 def bits(*rows: str) -> Tensor:
@@ -78,34 +79,64 @@ def ones(options: oracle.Options, assignment: oracle.Assignment) -> int:
     ],
 )
 def test_eq6_by_hand(completed: str, assignment: tuple[str, ...], alpha: float, expected: float) -> None:
-    value = high_level_reward(bits(completed), bits(*assignment).unsqueeze(0), alpha)
+    value = high_level_reward(bits(completed), bits(*assignment).unsqueeze(0), Charges(alpha))
     assert value.shape == (1,)
     assert value.item() == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("completed", "assignment", "expected"),
+    [
+        ("11", ("10", "10"), 0.2),  # 1/2 for the first; that the second is completed helps nobody: -0.3
+        ("00", ("00", "00"), -0.6),  # to assign nothing is no way out
+        ("01", ("10", "10"), -0.6),  # completed by chance is not completed by an agent assigned to it
+        ("11", ("10", "01"), 2.0),  # nothing changes where all targets are assigned
+        ("10", ("11", "01"), 0.7),
+    ],
+)
+def test_unassigned_targets_may_be_charged(completed: str, assignment: tuple[str, ...], expected: float) -> None:
+    """Earned by two agents of which each completes the same targets; the bounds of these as their only options."""
+    each, held = bits(completed, completed).unsqueeze(0), bits(*assignment).unsqueeze(0)
+    charges = Charges(0.3, "charged")
+    assert executed(each, held, charges).item() == pytest.approx(expected)
+    for name in ("paper", "exact"):
+        assert REGULATORS[name](each.unsqueeze(2), held, charges).item() == pytest.approx(expected)
+
+
+@given(batches())
+@settings(deadline=None)
+def test_charges_for_unassigned_targets_lower_every_value_alike(batch: Drawn) -> None:
+    options, assignment, charges = batch
+    price = charges.alpha * (assignment.sum(1) == 0).sum(-1)
+    free, charged = (charges._replace(unassigned=level) for level in ("free", "charged"))
+    for value in (REGULATORS["paper"], REGULATORS["exact"], lambda o, a, c: executed(o[:, :, 0], a, c)):
+        torch.testing.assert_close(value(options, assignment, charged), value(options, assignment, free) - price)
 
 
 @given(batches())
 @settings(deadline=None)
 def test_eq6_is_the_oracle(batch: Drawn) -> None:
-    options, assignment, alpha = batch
+    options, assignment, charges = batch
     completed = options[:, 0, 0]
-    expected = apply(oracle.reward, completed, assignment, alpha)
-    torch.testing.assert_close(high_level_reward(completed, assignment, alpha), expected)
+    expected = apply(oracle.reward, completed, assignment, charges)
+    torch.testing.assert_close(high_level_reward(completed, assignment, charges), expected)
 
 
 @pytest.mark.parametrize("dtype", [torch.bool, torch.int64, torch.float32])
 def test_assignment_in_any_dtype(dtype: torch.dtype) -> None:
     options, assignment = random_instances((64, 3, 4, 5), 0.4, 0.6, torch.Generator().manual_seed(1))
-    for function in (*REGULATORS.values(), lambda o, a, alpha: executed(o[:, :, 0], a, alpha)):
-        assert torch.equal(function(options, assignment.to(dtype), 0.2), function(options, assignment, 0.2))
+    for function in (*REGULATORS.values(), lambda o, a, charges: executed(o[:, :, 0], a, charges)):
+        assert torch.equal(*(function(options, held, Charges(0.2)) for held in (assignment.to(dtype), assignment)))
 
 
 def test_executed_counts_assigned_agents_only() -> None:
     completed = bits("110", "001").unsqueeze(0)  # agent 0 completes targets 0 and 1, agent 1 target 2
     swapped = bits("001", "110").unsqueeze(0)
     shared = bits("110", "011").unsqueeze(0)
-    assert executed(completed, completed, 0.3).item() == pytest.approx(3.0)
-    assert executed(completed, swapped, 0.3).item() == pytest.approx(-0.9)  # all completed, by the wrong agents
-    assert executed(completed, shared, 0.3).item() == pytest.approx(2.5)  # target 1: one of two suffices, and earns 1/2
+    charges = Charges(0.3)
+    assert executed(completed, completed, charges).item() == pytest.approx(3.0)
+    assert executed(completed, swapped, charges).item() == pytest.approx(-0.9)  # all completed, by the wrong agents
+    assert executed(completed, shared, charges).item() == pytest.approx(2.5)  # target 1: one of two suffices: 1/2
 
 
 @given(batches())
@@ -122,85 +153,85 @@ def test_paper_is_algorithm_1(batch: Drawn) -> None:
 
 def test_paper_keeps_the_first_of_equal_masks_at_the_size_of_the_paper() -> None:
     options, assignment = random_instances((400, 4, 13, 5), 0.3, 0.5, torch.Generator().manual_seed(2))
-    value = REGULATORS["paper"](options, assignment, 0.2)
-    torch.testing.assert_close(value, apply(oracle.algorithm1, options, assignment, 0.2))
-    flipped = REGULATORS["paper"](options.flip(2), assignment, 0.2)
+    value = REGULATORS["paper"](options, assignment, Charges(0.2))
+    torch.testing.assert_close(value, apply(oracle.algorithm1, options, assignment, Charges(0.2)))
+    flipped = REGULATORS["paper"](options.flip(2), assignment, Charges(0.2))
     assert not torch.equal(value, flipped), "the order of the options decides among equals, so some value must differ"
 
 
 @given(batches(agents=5, options=6, targets=8))
 @settings(deadline=None)
 def test_order_none_executed_paper_exact(batch: Drawn) -> None:
-    options, assignment, alpha = batch
+    options, assignment, charges = batch
     best = REGULATORS["exact"](*batch) + 1e-6
     assert (REGULATORS["none"](*batch) == -torch.inf).all()
     assert (REGULATORS["paper"](*batch) <= best).all()
     for d in range(options.shape[2]):  # what was executed is among the options
-        assert (executed(options[:, :, d], assignment, alpha) <= best).all()
+        assert (executed(options[:, :, d], assignment, charges) <= best).all()
 
 
 @given(batches(targets=8), st.randoms(use_true_random=False))
 @settings(deadline=None)
 def test_exact_does_not_depend_on_any_order(batch: Drawn, random: Random) -> None:
-    options, assignment, alpha = batch
-    value = REGULATORS["exact"](options, assignment, alpha)
+    options, assignment, charges = batch
+    value = REGULATORS["exact"](options, assignment, charges)
     agents, choices, targets = (random.sample(range(size), size) for size in options.shape[1:])
     moved = options[:, agents][:, :, choices][..., targets]
-    torch.testing.assert_close(REGULATORS["exact"](moved, assignment[:, agents][..., targets], alpha), value)
+    torch.testing.assert_close(REGULATORS["exact"](moved, assignment[:, agents][..., targets], charges), value)
 
 
 @given(batches())
 @settings(deadline=None)
 def test_exact_grows_with_what_an_option_completes_and_with_options(batch: Drawn) -> None:
-    options, assignment, alpha = batch
+    options, assignment, charges = batch
     value = REGULATORS["exact"](*batch) - 1e-6
     more = options | (torch.rand(options.shape, generator=torch.Generator().manual_seed(3)) < 0.2)
-    assert (REGULATORS["exact"](more, assignment, alpha) >= value).all()
-    assert (REGULATORS["exact"](torch.cat((options, more.flip(3)), 2), assignment, alpha) >= value).all()
+    assert (REGULATORS["exact"](more, assignment, charges) >= value).all()
+    assert (REGULATORS["exact"](torch.cat((options, more.flip(3)), 2), assignment, charges) >= value).all()
 
 
 @given(batches())
 @settings(deadline=None)
 def test_paper_is_exact_where_there_is_nothing_to_combine(batch: Drawn) -> None:
     """One agent, one option each, or one target: the sizes that the search for a counterexample may leave out."""
-    options, assignment, alpha = batch
+    options, assignment, charges = batch
     for o, a in (
         (options[:, :1], assignment[:, :1]),
         (options[:, :, :1], assignment),
         (options[..., :1], assignment[..., :1]),
     ):
-        torch.testing.assert_close(REGULATORS["paper"](o, a, alpha), REGULATORS["exact"](o, a, alpha))
+        torch.testing.assert_close(REGULATORS["paper"](o, a, charges), REGULATORS["exact"](o, a, charges))
 
 
 @given(batches(agents=5, options=6, targets=6))
 @settings(deadline=None)
 def test_paths_earn_what_the_regulators_say(batch: Drawn) -> None:
-    options, assignment, alpha = batch
+    options, assignment, charges = batch
     agents = list(range(options.shape[1]))
     for name, path in (("paper", algorithm1_path), ("exact", optimal_path)):
         values = REGULATORS[name](*batch)
         for b in range(B):
-            found = path(options[b], assignment[b], alpha)
+            found = path(options[b], assignment[b], charges)
             completed = options[b, agents, list(found.choices)]
             assert found.reward == pytest.approx(values[b].item())
-            assert executed(completed[None], assignment[b : b + 1], alpha).item() == pytest.approx(found.reward)
+            assert executed(completed[None], assignment[b : b + 1], charges).item() == pytest.approx(found.reward)
             assert list(found.completed) == (completed & assignment[b]).any(0).tolist()
 
 
-@pytest.mark.parametrize("regulator", [REGULATORS["exact"], lambda o, a, alpha: optimal_path(o[0], a[0], alpha)])
-def test_exact_refuses_too_many_targets(regulator: Callable[[Tensor, Tensor, float], object]) -> None:
+@pytest.mark.parametrize("regulator", [REGULATORS["exact"], lambda o, a, charges: optimal_path(o[0], a[0], charges)])
+def test_exact_refuses_too_many_targets(regulator: Callable[[Tensor, Tensor, Charges], object]) -> None:
     m = MOST_TARGETS + 1
     with pytest.raises(ValueError, match=f"at most {MOST_TARGETS} targets, and there are {m}"):
-        regulator(torch.ones(1, 2, 2, m).bool(), torch.ones(1, 2, m), 0.1)
+        regulator(torch.ones(1, 2, 2, m).bool(), torch.ones(1, 2, m), Charges(0.1))
 
 
 def test_exact_weighs_the_penalty_against_shared_targets() -> None:
     """One target of its own, or two that are shared by three agents: 1 - 2 alpha against 2/3 - alpha."""
     options = torch.stack((bits("100", "011"), bits("000", "000"), bits("000", "000"))).unsqueeze(0)
     assignment = bits("111", "011", "011").unsqueeze(0)
-    values = [REGULATORS["exact"](options, assignment, alpha).item() for alpha in (0.0, 0.3, 0.4, 1.0)]
+    values = [REGULATORS["exact"](options, assignment, Charges(alpha)).item() for alpha in (0.0, 0.3, 0.4, 1.0)]
     assert values == pytest.approx([1, 1 - 0.6, 2 / 3 - 0.4, 2 / 3 - 1])
-    assert REGULATORS["paper"](options, assignment, 0.0).item() == pytest.approx(2 / 3)
+    assert REGULATORS["paper"](options, assignment, Charges(0.0)).item() == pytest.approx(2 / 3)
 
 
 def test_exact_holds_the_number_of_ways_to_a_set() -> None:
@@ -208,14 +239,14 @@ def test_exact_holds_the_number_of_ways_to_a_set() -> None:
     every = torch.tensor(list(product((False, True), repeat=10)))  # full set: 3^10 ways
     few = every[every.sum(-1) <= 4]  # 386 options: two reach eight targets, never nine
     assignment = torch.ones(1, 2, 10)
-    assert REGULATORS["exact"](every.expand(1, 2, -1, 10), assignment, 0.5).item() == pytest.approx(5)
-    assert REGULATORS["exact"](few.expand(1, 2, -1, 10), assignment, 0.5).item() == pytest.approx(4 - 2 * 0.5)
+    assert REGULATORS["exact"](every.expand(1, 2, -1, 10), assignment, Charges(0.5)).item() == pytest.approx(5)
+    assert REGULATORS["exact"](few.expand(1, 2, -1, 10), assignment, Charges(0.5)).item() == pytest.approx(4 - 2 * 0.5)
 
 
 def test_largest_exact_table() -> None:
     m = MOST_TARGETS
     options = torch.eye(m).bool().expand(1, 3, m, m)  # option d completes target d: three agents reach three targets
-    assert REGULATORS["exact"](options, torch.ones(1, 3, m), 0.0).item() == pytest.approx(1.0)
+    assert REGULATORS["exact"](options, torch.ones(1, 3, m), Charges(0.0)).item() == pytest.approx(1.0)
 
 
 def test_the_smallest_counterexample_by_reward() -> None:
@@ -249,7 +280,7 @@ def test_two_agents_reach_the_largest_count() -> None:
     """The reason why the counterexample by count needs three agents."""
     options, assignment = random_instances((300, 2, 4, 5), 0.3, 0.7, torch.Generator().manual_seed(4))
     for o, a in zip(options, assignment, strict=True):
-        path = algorithm1_path(o, a, 0.0)
+        path = algorithm1_path(o, a, Charges(0.0))
         masks = (o & a.unsqueeze(1)).unbind(0)
         counts = (masks[0].unsqueeze(0) | masks[1].unsqueeze(1)).sum(-1)
         assert counts[path.choices[1]].max() == sum(path.completed)
@@ -258,7 +289,8 @@ def test_two_agents_reach_the_largest_count() -> None:
 def test_shortfall_table_counts_what_the_oracles_count() -> None:
     (row,) = shortfall_table(300, seed=5, sizes=((3, 3, 4),), densities=((0.4, 0.7),), alpha=0.3)
     options, assignment = random_instances((300, 3, 3, 4), 0.4, 0.7, torch.Generator().manual_seed(5))
-    gap = apply(oracle.optimum, options, assignment, 0.3) - apply(oracle.algorithm1, options, assignment, 0.3)
+    best, found = (apply(f, options, assignment, Charges(0.3)) for f in (oracle.optimum, oracle.algorithm1))
+    gap = best - found
     lost = gap > 1e-6
     assert 0 < int(lost.sum()) < 300
     assert row.lost == int(lost.sum())
