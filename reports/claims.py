@@ -110,7 +110,7 @@ class Evidence:
         return table[list(self.results.finished(study, arm)["seed"])]
 
     def present(self, study: str, arms: Iterable[str]) -> list[str]:
-        """Those arms that have at least two finished seeds."""
+        """The arms that have at least two finished seeds."""
         return [arm for arm in arms if len(self.results.finals(study, arm)) > 1]
 
     def rivals(self, study: str) -> tuple[list[str], list[str]]:

@@ -1,4 +1,4 @@
-"""Tables that are filled by those who stand in them: a kind is registered by the page that defines it."""
+"""Registries of methods and tasks: each kind is registered by the page that defines it."""
 
 from typing import NamedTuple, TypeVar
 

@@ -2,7 +2,8 @@
 
 Everything heavy is imported by the verb that needs it, so that help answers at once.
 
-Exit codes: 0 done, 1 some run failed, 2 bad input (nothing was started), 130 interrupted, 143 terminated.
+Exit codes: 0 done, 1 some run failed or some arm does not hold, 2 bad input (nothing was started), 130 interrupted,
+143 terminated.
 """
 
 import errno

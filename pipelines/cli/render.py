@@ -30,8 +30,8 @@ def render(
     frames: Annotated[int, typer.Option(min=2, max=1000, help="At most so many; the steps between are left out.")] = 40,
     profile: Profile = "quick",
     variant: Variant = None,
-    arm: Annotated[str | None, typer.Option(help="Of a study.")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, max=SEED, help="Of a study.")] = None,
+    arm: Annotated[str | None, typer.Option(help="Arm of the study.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, max=SEED, help="Seed of the run.")] = None,
 ) -> None:
     """Draw one episode of a trained policy as an animation."""
     from pipelines.policies.render import render as draw

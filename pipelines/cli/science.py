@@ -94,7 +94,7 @@ def drawings(
 def report(
     profile: Profile = "quick",
     study: Annotated[Path | None, typer.Option(metavar="FILE", help="Report on this study alone.")] = None,
-    variant: Annotated[str | None, typer.Option(help="Of that study.")] = None,
+    variant: Annotated[str | None, typer.Option(help="Variant of that study.")] = None,
     runs: Annotated[Path | None, typer.Option(help="Exported tables; results/<profile>/runs if not given.")] = None,
     out: Annotated[
         Path | None,

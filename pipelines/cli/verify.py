@@ -21,12 +21,12 @@ def verify(
     retrain: Annotated[
         int, typer.Option(min=0, metavar="K", help="Train K published runs anew instead, drawn at random.")
     ] = 0,
-    seed: Annotated[int, typer.Option(min=0, help="Of the draw.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random draw.")] = 0,
     runs: Annotated[Path | None, typer.Option(help="Exported tables; what the log holds if not given.")] = None,
     published: Annotated[Path | None, typer.Option(help="Published tables; the repository's if not given.")] = None,
     margin: Annotated[float, typer.Option(min=0.01, help="Points of return within which arms are equivalent.")] = 1.0,
     jobs: Annotated[int, typer.Option(min=1, help="Trainings at a time.")] = 2,
-    publish: Annotated[bool, typer.Option("--publish", help="Replace the published results by those here.")] = False,
+    publish: Annotated[bool, typer.Option("--publish", help="Replace the published results with those here.")] = False,
 ) -> None:
     """Compare results with the published ones: the same bytes, or per arm the difference and a test of equivalence.
 

@@ -19,7 +19,7 @@ TASKS: tuple[EnvConfig, ...] = (coverage.Config(agents=4, targets=5), navigation
 
 
 class Count(NamedTuple):
-    """Numbers of parameters: of the networks that act greedily, and of all that learn (slow copies left out)."""
+    """Numbers of parameters: of the networks that act greedily, and of all that learn (target networks left out)."""
 
     acting: int
     all: int

@@ -148,7 +148,7 @@ def _kept(tracker: Tracker, run: Recorded, item: Item) -> Saved | None:
 
 
 def _begun(home: Home, item: Item) -> Saved | None:
-    """That of a run under way, which may be training meanwhile."""
+    """The policy of a run under way, which may be training meanwhile."""
     with suppress(NoPolicyError):
         return load(home.checkpoints(item.key), item.spec)
     return None

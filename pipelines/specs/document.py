@@ -142,7 +142,7 @@ class _Reader:
                 return None, self.aliased
         except (MaxDepthExceededError, _TooManyError) as error:
             text = f"more than {NODES:,} keys and values" if isinstance(error, _TooManyError) else "nested too deeply"
-            return None, [*self.faults, Fault(self._place(error), path, f"{text}; this is no study")]
+            return None, [*self.faults, Fault(self._place(error), path, f"{text}; this is not a study")]
         except MarkedYAMLError as error:
             return None, [*self.faults, Fault(self._place(error), path, _syntax(error))]
         except YAMLError as error:

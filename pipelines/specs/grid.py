@@ -62,7 +62,7 @@ def replaced(grid: Node | None, by: Node | None) -> tuple[Node | None, list[Faul
 
 
 def faults_of(key: str, node: Node, fields: Collection[str]) -> list[Fault]:
-    """What is wrong with a dotted key or its list of values. fields: as in `points`."""
+    """Faults of a dotted key or its list of values. fields: as in `points`."""
     section, _, field = key.partition(".")
     if not field or section not in {name.partition(".")[0] for name in fields}:
         same = [name for name in fields if name.endswith(f".{key}")]

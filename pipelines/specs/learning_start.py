@@ -13,7 +13,7 @@ from rhmc.learning.settings import OffPolicy, OnPolicy
 
 
 class Start(NamedTuple):
-    """When a part of a method makes its first update, and what it waits for. None: never."""
+    """First update of a part of a method, and what it waits for. None: never."""
 
     step: int | None
     waits: str

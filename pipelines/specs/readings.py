@@ -163,7 +163,7 @@ def _too_many(readings: int, arms: int) -> str:
 
 
 def _faults(name: str, factor: Node, fields: Collection[str]) -> list[Fault]:
-    """What is wrong with the shape of a factor."""
+    """Faults in the shape of a factor."""
     if isinstance(factor.value, list):
         faults = faults_of(name, factor, fields)
     elif isinstance(factor.value, dict):

@@ -59,7 +59,7 @@ class Dimension(Frozen):
 
     low: float | None = None
     high: float | None = None
-    log: bool = Field(False, description="even in the logarithm")
+    log: bool = Field(False, description="sampled evenly in the logarithm")
     step: float | None = Field(None, gt=0)
     choices: list[Any] | None = Field(None, min_length=1)
     whole: bool = Field(False, description="only whole numbers; follows from the method's field")
@@ -107,12 +107,12 @@ class Sampler(Frozen):
 
 
 class Pruner(Frozen):
-    """Which trials are given up early, by the mean of all their seeds at a point of the curve."""
+    """Rule for pruning trials, by the mean of all their seeds at a point of the curve."""
 
     kind: Literal["none", "median", "asha"] = "none"
     startup: int = Field(5, ge=1, description="median: trials that are never given up")
     warmup: int = Field(1, ge=1, description="points of the curve before the first decision")
-    reduction: int = Field(3, ge=2, description="asha: of so many trials one goes on")
+    reduction: int = Field(3, ge=2, description="asha: one in this many trials goes on")
 
 
 class SearchArm(Frozen):

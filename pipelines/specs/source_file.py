@@ -1,4 +1,4 @@
-"""Which file a study or a search was launched from.
+"""The file from which a study or a search was launched.
 
 Two files of one stem, `a/one.yaml` and `b/one.yaml`, have one experiment, one lock and one table. That is how a study
 goes on that was moved, so a launch does not refuse it: it says so once, and so do `check` and `export`.

@@ -657,7 +657,7 @@ def study_fault(name: str) -> str:
 def arm_fault(name: str) -> str:
     """The fault of the name of an arm, or nothing."""
     if not all(map(seen, name)):
-        return f"{show(name)} is no name for an arm; it has characters that cannot be seen"
+        return f"{show(name)} is not a name for an arm; it has characters that cannot be seen"
     arm = Node(None, Place(""), Place(""), "")
     found = _name_faults(name, arm) or ([_long_name(name, arm)] if len(name) > ARM else [])
     return found[0].text if found else ""
@@ -705,7 +705,7 @@ def _no_value(root: Node, name: str, profile: str) -> list[Fault]:
 def _name_faults(name: str, arm: Node) -> list[Fault]:
     if name and name == name.strip() and "/" not in name:  # that it can be seen is said of every key
         return []
-    return [Fault(arm.key, arm.path, f"{show(name)} is no name for an arm; use a few words, without '/'")]
+    return [Fault(arm.key, arm.path, f"{show(name)} is not a name for an arm; use a few words, without '/'")]
 
 
 def _alike_faults(what: str, named: Mapping[str, Node]) -> list[Fault]:
@@ -718,7 +718,7 @@ def _alike_faults(what: str, named: Mapping[str, Node]) -> list[Fault]:
 
 
 def _long_name(name: str, arm: Node) -> Fault:
-    text = f"{show(name)} is no name for an arm; it has {len(name):,} characters, at most {ARM}"
+    text = f"{show(name)} is not a name for an arm; it has {len(name):,} characters, at most {ARM}"
     return Fault(arm.key, arm.path, text)
 
 

@@ -21,7 +21,7 @@ ORDER = (*FIRST, *(place for place in range(len(PALETTE)) if place not in FIRST)
 
 
 def colour(place: int) -> str:
-    """That of a study's arm, which are counted from 0; it comes again after as many as there are colours."""
+    """The colour of a study's arm, counted from 0. After the last colour the first one comes again."""
     return PALETTE[ORDER[place % len(ORDER)]]
 
 

@@ -48,7 +48,7 @@ def _reason(run: Recorded, plan: Sequence[Item], tracker: Tracker, copied: Copie
 
 
 def _code(run: Recorded, item: Item, copied: Copied) -> str:
-    """Which modules changed since; nothing where the log has a copy of the run under later code."""
+    """The modules that changed since; nothing where the log has a copy of the run under later code."""
     if (run.arm, item.card.spec_id, run.code) in copied:
         return ""
     if not run.modules:
@@ -59,7 +59,7 @@ def _code(run: Recorded, item: Item, copied: Copied) -> str:
 
 
 def _settings(before: RunSpec, now: RunSpec) -> str:
-    """Which settings are other now; nothing where only the seed is."""
+    """The settings that differ now; nothing where only the seed is."""
     old, new = (flatten(spec.model_dump(mode="json", exclude={"seed"})) for spec in (before, now))
     names = [name for name in sorted({*old, *new}) if old.get(name) != new.get(name)]
     said = [f"{name} was {old.get(name)}, now {new.get(name)}" for name in names]

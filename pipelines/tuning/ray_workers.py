@@ -92,7 +92,7 @@ class Taken:
     deaths: Deaths = field(default_factory=Deaths)
 
     def new(self, points: list[Metrics]) -> list[Metrics]:
-        """Those that no worker told before: one that continues a trial tells all of them once more."""
+        """The points that no worker told before: one that continues a trial tells all of them once more."""
         self.seen += len(points)
         fresh = points[len(points) - max(0, self.seen - self.told) :]
         if fresh:

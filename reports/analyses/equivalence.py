@@ -166,7 +166,7 @@ COLUMNS = ["study", "arm", "seeds", "difference [95 %]", "p", "outcome", "note"]
 
 
 def summary(compared: Sequence[Compared], name: str) -> str:
-    """One line: how the results here stand to those of that name."""
+    """One line: how the results here compare with the published ones of that name."""
     if all(one.outcome == "byte-equal" for one in compared):
         return f"byte-equal to the published {name} results: {_arms(len(compared))}"
     counts = {outcome: sum(one.outcome == outcome for one in compared) for one in compared for outcome in [one.outcome]}

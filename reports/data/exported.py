@@ -43,7 +43,7 @@ STUDY = re.compile(r"[\w-]+(@[\w-]+)?")  # a study's name, and of a variant
 
 
 def part(path: Path) -> str:
-    """Which of `FORMS` a file has."""
+    """The form, of `FORMS`, of a file."""
     if path.name == f"{MOVED}.parquet":
         return MOVED
     second = path.name.removesuffix(".parquet").partition(".")[2]

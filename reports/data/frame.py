@@ -371,7 +371,7 @@ def _of_plan(tables: Mapping[str, pd.DataFrame]) -> tuple[pd.DataFrame, pd.DataF
 
 
 def _only(files: Sequence[Path], study: str, folder: Path) -> list[Path]:
-    """Those of a study and of the yardsticks."""
+    """The files of a study and of the yardsticks."""
     other = (YARDSTICKS, THEOREM, MOVED)
     names = sorted({name for path in files if (name := path.name.split(".")[0]) not in other})
     if study not in names:
@@ -394,7 +394,7 @@ def _with_made(runs: pd.DataFrame, made: pd.DataFrame) -> pd.DataFrame:
 
 def _made_faults(made: pd.DataFrame) -> Iterator[str]:
     for row in made[made.duplicated(PLACE)].itertuples():
-        yield f"{_name(row)}, run {row.run}: how it was made stands there twice"
+        yield f"{_name(row)}, run {row.run}: how it was made is there twice"
 
 
 def _plan_faults(results: Results) -> Iterator[str]:
@@ -443,7 +443,7 @@ def _point_faults(results: Results) -> Iterator[str]:
         for row in shown[~np.isfinite(shown["value"].astype(float))].itertuples()
     )
     yield from _first(
-        f"{_name(row)}, run {row.run}: {row.metric} at step {row.step} stands there twice"
+        f"{_name(row)}, run {row.run}: {row.metric} at step {row.step} is there twice"
         for row in points[points.duplicated([*keys, "step", "metric"])].itertuples()
     )
     studied = points[points["study"] != THEOREM]

@@ -234,7 +234,7 @@ def _resample(x: Values, stream: int = 0) -> Values:
 
 @cache
 def _picks(n: int, stream: int) -> NDArray[np.int64]:
-    """Which values each resample takes: (RESAMPLES, n). Samples of different streams are drawn independently."""
+    """Indices of the values in each resample: (RESAMPLES, n). Samples of different streams are drawn independently."""
     return np.random.default_rng((SEED, stream)).integers(0, n, (RESAMPLES, n))
 
 

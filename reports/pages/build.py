@@ -452,7 +452,7 @@ def _lead(results: Results) -> str:
 
 
 def _summary(results: Results) -> str:
-    """Which studies, with budget and seeds, in one sentence each."""
+    """Budget and seeds of each study, in one sentence."""
     lines = []
     for study in results.studies:
         plan, budget = results.plan(study), results.budget(study)

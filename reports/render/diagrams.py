@@ -91,7 +91,9 @@ def architecture(builds: Sequence[Build]) -> Drawing:
             axes.text(at[0], at[1], words, fontsize=8, color=QUIET)
         axes.plot([10.5, 14.8], [5.9, 5.9], color=QUIET, linewidth=1.1)
         foot(
-            figure, "Traced from the built networks; slow copies not shown. Widths: features in → units of each layer."
+            figure,
+            "Traced from networks built with the method's defaults; target networks not shown. "
+            "Widths: features in → units of each layer.",
         )
     return Drawing(figure, numbers(builds, ("coordinator", "executor")))
 

@@ -120,7 +120,7 @@ class HiTMAC:
         return logs
 
     def learners(self) -> Learners:
-        """Those of both levels."""
+        """The learners of both levels."""
         return [*self.coordinator.learners(), *self.executor.learners()]
 
     # Checkpoints

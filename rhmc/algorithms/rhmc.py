@@ -132,7 +132,7 @@ class RHMC:
         return logs
 
     def learners(self) -> Learners:
-        """Those of both levels."""
+        """The learners of both levels."""
         return [*self.coordinator.learners(), *self.executor.learners()]
 
     # Checkpoints

@@ -221,7 +221,7 @@ def _best_subset(reachable: Tensor, assignment: Tensor, alpha: float) -> Tensor:
 
 
 def _members(m: int, device: torch.device) -> Tensor:
-    """Which targets each set number holds: (2^M, M) bool."""
+    """The targets of each set number: (2^M, M) bool."""
     numbers = torch.arange(2**m, device=device).unsqueeze(-1)
     return (numbers >> torch.arange(m, device=device)) & 1 > 0
 

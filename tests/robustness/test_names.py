@@ -230,7 +230,7 @@ def test_an_arm_of_many_letters_is_refused() -> None:
     assert "a key of 201 characters" in said
     grid = "grid: {algo.gamma: [0.1, 0.2]}\n"
     said = "; ".join(faults(written(["a" * 190], more=grid)))
-    assert "is no name for an arm; it has 201 characters, at most 200" in said
+    assert "is not a name for an arm; it has 201 characters, at most 200" in said
 
 
 # Two files of one stem
@@ -378,9 +378,9 @@ def test_an_arm_that_is_asked_for_is_shown(tmp_path: Path) -> None:
             + "".join(f"{chr(98 + i)}: &{chr(98 + i)} [*{chr(97 + i)}, *{chr(97 + i)}]\n" for i in range(20)),
             "1:4: b.0: used again by an alias; aliases are not read here, write the value out",
         ),
-        ("a: " + "[" * 100_000, "1:33: nested too deeply; this is no study"),
-        ("a: " + "{b: " * 40 + "1" + "}" * 40, "1:117: nested too deeply; this is no study"),
-        ("".join(f"k{i}: 1\n" for i in range(20_000)), "5000:8: more than 10,000 keys and values; this is no study"),
+        ("a: " + "[" * 100_000, "1:33: nested too deeply; this is not a study"),
+        ("a: " + "{b: " * 40 + "1" + "}" * 40, "1:117: nested too deeply; this is not a study"),
+        ("".join(f"k{i}: 1\n" for i in range(20_000)), "5000:8: more than 10,000 keys and values; this is not a study"),
         ("arms:\n" + "".join(f"  a{i}: {{}}\n" for i in range(1001)), "1:1: arms: 1,001 of them; at most 1,000"),
         ("variants:\n" + "".join(f"  a{i}: {{}}\n" for i in range(101)), "1:1: variants: 101 of them; at most 100"),
     ],

@@ -532,7 +532,7 @@ PARTS = [
     (ARMS, "arms: {}\n", ["5:7: arms: {} is not allowed; must not be empty"]),
     (ARMS, "arms: [full]\n", ['5:7: arms: ["full"] is not allowed; must be a mapping']),
     ("full: {}", "full: 3", ["6:9: arms.full: 3 is not allowed; must be a mapping"]),
-    ("full: {}", "a/b: {}", ["6:3: arms.a/b: 'a/b' is no name for an arm; use a few words, without '/'"]),
+    ("full: {}", "a/b: {}", ["6:3: arms.a/b: 'a/b' is not a name for an arm; use a few words, without '/'"]),
     ("full: {}", "full: {}\n  twin: {}", ["7:3: arms.twin: arm 'twin' is the same as arm 'full'"]),
     ("full: {}", "none: {}", ["7:3: arms.none: duplicate key 'none', first in line 6"]),
     # numbers of runs
@@ -597,7 +597,7 @@ def test_files_that_cannot_be_read() -> None:
 
 
 def test_a_nest_without_end() -> None:
-    assert faults("x: " + "[" * 600) == ["studies/x.yaml:1:33: nested too deeply; this is no study"]
+    assert faults("x: " + "[" * 600) == ["studies/x.yaml:1:33: nested too deeply; this is not a study"]
 
 
 def test_an_unknown_profile() -> None:

@@ -91,7 +91,7 @@ def words(points: pd.DataFrame, runs: pd.DataFrame) -> Tables:
         (not_finite, "ablation, arm 'full', seed 1, run {run}, step 150000: final/return is nan"),
         (hole_in_a_curve, "ablation, arm 'full', seed 1, run {run}, step 75000: eval/return is nan"),
         (infinite, "ablation, arm 'full', seed 1, run {run}, step 150000: final/return is inf"),
-        (doubled, "ablation, arm 'full', seed 1, run {run}: eval/return at step 0 stands there twice"),
+        (doubled, "ablation, arm 'full', seed 1, run {run}: eval/return at step 0 is there twice"),
         (hole, "ablation, arm 'full', seed 1: planned for other arms, and not for this one"),
         (no_final, "ablation, arm 'full', seed 1, run {run}: marked finished, and final/return is not there"),
         (ghost, "ablation, arm 'full', seed 0, run {first}: marked missing, and has points"),
@@ -172,9 +172,7 @@ def test_how_a_run_was_made_stands_there_once(tmp_path: Path) -> None:
     folder = write(tmp_path, study("ablation", ARMS))
     made = pd.read_parquet(folder / "ablation.made.parquet")
     pd.concat([made, made.head(1)]).to_parquet(folder / "ablation.made.parquet")
-    with pytest.raises(
-        TableError, match=r"^ablation, arm 'full', seed 0, run \w+: how it was made stands there twice$"
-    ):
+    with pytest.raises(TableError, match=r"^ablation, arm 'full', seed 0, run \w+: how it was made is there twice$"):
         load(folder, "quick")
 
 

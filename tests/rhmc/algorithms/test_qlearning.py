@@ -67,7 +67,7 @@ def loss(q: QLearning, data: Batch) -> float:
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("double", [True, False])
 def test_targets_by_hand(kind: str, double: bool) -> None:
-    """Double Q: the network chooses (2, 0), the slow copy values that (30, 7); else its own best (50, 9)."""
+    """Double Q: the network chooses (2, 0), the target network values that (30, 7); else its own best (50, 9)."""
     later = mixed(kind, 30, 7) if double else mixed(kind, 50, 9)
     expected = []
     for reward, live, now in ((0.25, 1, mixed(kind, 1, 3)), (-4, 0, mixed(kind, 2, 0.5))):
@@ -92,7 +92,7 @@ def test_standardised_rewards_by_hand(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_standardised_returns_by_hand(kind: str) -> None:
-    """The slow copy's output means a return by the statistics so far; a target counts in them before it is one."""
+    """The target network's output means a return by the statistics so far; a target counts in them before it is one."""
     q = learner(kind, standardise="return")
     q.standardiser.update_returns(torch.tensor([4.0, 8.0]))  # mean 6, deviation 2
     target = [0.25 + 0.5 * (v * 2 + 6) for v in mixed(kind, 30, 7)]

@@ -49,7 +49,7 @@ def known(**changes: Any) -> QMIXExecutor:
 
 @pytest.mark.parametrize("terminated", [False, True])
 def test_target_by_hand(terminated: bool) -> None:
-    """The network chooses actions 1 and 2, the slow copy values them at 20 and 9; executors earn 0.5 and -1."""
+    """The network chooses actions 1 and 2, the target network values them at 20 and 9; executors earn 0.5 and -1."""
     reward, done = torch.tensor([[0.5, -1.0]]), torch.tensor([terminated])
     logs = known().update(rows(reward=reward, action=torch.tensor([[2, 0]]), terminated=done))
     target = -0.25 + (0 if terminated else 0.5 * (2 * 20 + 9 + 1))

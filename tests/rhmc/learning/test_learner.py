@@ -1,4 +1,4 @@
-"""The replay ring, and a network with its slow copy and optimiser."""
+"""The replay ring, and a network with its target network and optimiser."""
 
 from collections import deque
 from copy import deepcopy
