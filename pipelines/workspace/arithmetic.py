@@ -1,4 +1,4 @@
-"""Checks which of torch's operations give the published bytes here: to be asked when a result differs from the published one.
+"""Checks which of torch's operations give the published bytes here, for when a result differs from the published one.
 
 Each group is a handful of operations that training and evaluation use, at the sizes that they use, on one thread.
 """

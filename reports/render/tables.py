@@ -65,8 +65,8 @@ def table_1(results: Results) -> Table:
         )
     note = (
         "Generated from the code's table of algorithms. Parameters are counted in the networks that each method builds "
-        f"with its default settings for {joined(tasks)}: those that act, and in brackets all that learn; target networks "
-        "are not counted."
+        f"with its default settings for {joined(tasks)}: those that act, and in brackets all that learn; target "
+        "networks are not counted."
     )
     return Table("Table 1: the methods", pd.DataFrame(numbers), pd.DataFrame(shown), note)
 
