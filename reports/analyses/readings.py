@@ -12,16 +12,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from numpy.typing import NDArray
 from scipy.stats import f, permutation_test, t
 
 from reports.data.frame import FINAL, ORDER, Results
 from reports.data.stats import LEVEL, SEED, Interval, holm
-from reports.render.tables import NONE, Table, estimate, number, percent
+from reports.render.canvas import FAINT, QUIET, Drawing, blank, foot, head, styled
+from reports.render.tables import NONE, Table, describe_task, estimate, number, percent
 
 RESAMPLES = 9_999  # swaps of labels
 NOTHING = "random"  # the yardstick that has learned nothing
 TOLERANCE = 2.0  # points above it that are nothing still
+# Inches: width, height of the upper axes, of a row of levels, of what is above and below, and of the words on the left
+WIDE, TALL, ROW, ABOVE, BELOW, BESIDE = 9.6, 2.4, 0.145, 0.75, 0.55, 2.4
+BETTER, WORSE = "#0072B2", "#D55E00"  # of effects whose interval is above, below zero
 
 Values = NDArray[np.float64]
 
@@ -63,6 +68,11 @@ def contrasts(results: Results, study: str) -> list[Contrast]:
     return [_contrast(results, table, arms[0], arm) for arm in arms[1:]]
 
 
+def _begun(results: Results, study: str) -> list[Contrast]:
+    """The contrasts of which a reading is finished."""
+    return [one for one in contrasts(results, study) if len(one.effects)]
+
+
 def _contrast(results: Results, table: pd.DataFrame, full: str, without: str) -> Contrast:
     study = str(table["study"].iloc[0])
     named = table.drop_duplicates("arm").set_index(["contrast", "reading"])["arm"]
@@ -71,7 +81,8 @@ def _contrast(results: Results, table: pd.DataFrame, full: str, without: str) ->
     wide = own.pivot_table(index="reading", columns="factor", values="level", aggfunc="first")[list(order)]
     pairs = {r: [_whole(results, study, named[arm, r]) for arm in (full, without)] for r in wide.index}
     done = [r for r, values in pairs.items() if all(len(one) for one in values)]
-    both = np.array([pairs[r] for r in done]).reshape(len(done), 2, -1)
+    seeds = len(results.plan(study, named[full, wide.index[0]]))
+    both = np.array([pairs[r] for r in done]).reshape(len(done), 2, seeds)
     return Contrast(without, wide.loc[done], both[:, 0], both[:, 1], len(wide) - len(done))
 
 
@@ -156,7 +167,92 @@ def unlearned(results: Results, study: str, values: Values) -> NDArray[np.bool_]
     return np.asarray(values.mean(1) <= scores[FINAL].astype(float).to_dict()[NOTHING] + TOLERANCE)
 
 
+# Figure
+
+
+def fig_curve(results: Results, study: str, found: Contrast) -> Drawing | None:
+    """Effects by reading, smallest first, with intervals; below, the level of every factor. None without a reading."""
+    if not len(found.effects):
+        return None
+    table = curve(results, study, found).numbers
+    lines = [(factor, level) for factor, levels in _named(results, study).items() for level in levels]
+    height = ABOVE + TALL + ROW * (len(lines) + 1) + BELOW
+    with styled():
+        figure = blank(WIDE, height)
+        head(figure, f"Whole method less '{found.without}', by reading", describe_task(results.env(study)))
+        left, width = BESIDE / WIDE, 1 - (BESIDE + 0.2) / WIDE
+        upper = figure.add_axes((left, 1 - (ABOVE + TALL) / height, width, TALL / height))
+        lower = figure.add_axes((left, BELOW / height, width, ROW * len(lines) / height), sharex=upper)
+        _draw_effects(upper, table)
+        _draw_levels(lower, table, lines)
+        foot(
+            figure,
+            "points of final return with 95 % intervals from the pooled variance; blue above zero, orange below; hollow: "
+            "an arm learned nothing",
+        )
+    return Drawing(figure, table)
+
+
+def _named(results: Results, study: str) -> dict[str, list[str]]:
+    """The levels of each factor, in the study's order."""
+    rows = results.levels[results.levels["study"] == study].sort_values(["place", "number"])
+    return {str(name): list(group["level"].unique()) for name, group in rows.groupby("factor", sort=False)}
+
+
+def _draw_effects(axes: Axes, table: pd.DataFrame) -> None:
+    colours = np.select([table["low"] > 0, table["high"] < 0], [BETTER, WORSE], QUIET)
+    idle = (table["full_unlearned"] | table["without_unlearned"]).to_numpy(bool)
+    places = np.arange(len(table))
+    axes.axhline(0, color=QUIET, linewidth=0.8)
+    axes.vlines(places, table["low"], table["high"], colors=list(colours), linewidth=1.0, alpha=0.6)
+    faces = np.where(idle, "white", colours)
+    axes.scatter(places, table["effect"], s=14, c=list(faces), edgecolors=list(colours), linewidths=0.9, zorder=3)
+    axes.set_ylabel("effect")
+    axes.tick_params(labelbottom=False, bottom=False)
+
+
+def _draw_levels(axes: Axes, table: pd.DataFrame, lines: list[tuple[str, str]]) -> None:
+    """A mark where a reading has a level, a row for each level; every other factor is shaded."""
+    factors = list(dict.fromkeys(factor for factor, _ in lines))
+    for row, (factor, level) in enumerate(lines):
+        places = np.flatnonzero(table[factor] == level)
+        axes.scatter(places, np.full(len(places), row), s=7, marker="s", c="black", linewidths=0)
+        if factors.index(factor) % 2:
+            axes.axhspan(row - 0.5, row + 0.5, color=FAINT, alpha=0.35, linewidth=0, zorder=0)
+    names = [f"{factor.removeprefix('algo.')}: {level}" for factor, level in lines]
+    axes.set_yticks(range(len(lines)), names, fontsize=6.5)
+    axes.set_ylim(len(lines) - 0.5, -0.5)
+    axes.set_xlim(-1, len(table))
+    axes.set_xticks([])
+    axes.tick_params(left=False)
+    axes.grid(visible=False)
+
+
 # Tables
+
+
+def tables(results: Results, study: str) -> dict[str, Table]:
+    """All tables of a study, by kind; none as long as no reading is finished."""
+    found = _begun(results, study)
+    if not found:
+        return {}
+    return {
+        "effects": summary(results, study),
+        "factors": main_effects(results, study),
+        "readings": joined_curves([curve(results, study, one) for one in found], [one.without for one in found], study),
+    }
+
+
+def joined_curves(curves: list[Table], withouts: list[str], study: str) -> Table:
+    """The curves of all contrasts in one table."""
+    numbers, shown = (
+        pd.concat(
+            [getattr(one, name).assign(**{key: w}) for one, w in zip(curves, withouts, strict=True)], ignore_index=True
+        )
+        for name, key in (("numbers", "without"), ("shown", "Without"))
+    )
+    shown = shown[["Without", *(name for name in shown if name not in ("Without", "Full", "without"))]]
+    return Table(f"Effects by reading, study {study}", numbers, shown, curves[0].note)
 
 
 def curve(results: Results, study: str, found: Contrast) -> Table:
@@ -195,7 +291,7 @@ def _idle(row: NDArray[np.bool_]) -> str:
 def summary(results: Results, study: str) -> Table:
     """A row per contrast: in how many readings the paper's order holds, and by how much."""
     rows = []
-    for found in contrasts(results, study):
+    for found in _begun(results, study):
         ranges, effects = intervals(found), found.effects
         lost = 100 * (found.other.mean(1) / found.full.mean(1) - 1)
         quarter, median, three = np.quantile(effects, [0.25, 0.5, 0.75])
@@ -238,7 +334,7 @@ def _summarised(row: Mapping[str, Any]) -> dict[str, str]:
 def main_effects(results: Results, study: str) -> Table:
     """A row per contrast, factor and level: the effect there, averaged over the other factors."""
     tables, shown = [], []
-    for found in contrasts(results, study):
+    for found in _begun(results, study):
         fit = fitted(found)
         both = fit.levels.merge(fit.factors, on="factor").assign(without=found.without)
         tables.append(both)

@@ -130,6 +130,10 @@ class Results:
         found = set(self.plan(study)["arm"])
         return sorted(found, key=lambda arm: (ORDER.index(arm) if arm in ORDER else len(ORDER), arm))
 
+    def has_readings(self, study: str) -> bool:
+        """True if the arms of a study are trained under several readings of the paper."""
+        return study in set(self.levels["study"])
+
     def plan(self, study: str, arm: str | None = None) -> pd.DataFrame:
         """Planned runs of a study or of one of its arms, by arm and seed."""
         if (study, arm) not in self._plans:

@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple, TypeVar
 
 from reports import claims as rules
-from reports.analyses import beyond, comparison, scaling
+from reports.analyses import beyond, comparison, readings, scaling
 from reports.claims import VERDICTS, Claim
 from reports.data.escaping import code, markdown, prose, stem, words
 from reports.data.frame import Results, TableError, load, mixed
@@ -62,7 +62,10 @@ DEFINITIONS = (
 Part = TypeVar("Part")
 FIRST = ("navigation", "coverage", "scaling", "ablation")  # studies of the paper, in its order
 MORE = ("profile_", "better_", "pairs_", "steadiness_", "time_", "yardsticks")
-KINDS = ("final", "pairs", "efficiency", "time", "assignments", "steadiness", "agents")  # of tables of every study
+KINDS = (  # of tables of a study
+    *("effects", "factors", "readings"),
+    *("final", "pairs", "efficiency", "time", "assignments", "steadiness", "agents"),
+)
 LAST = ("provenance", "runs", "made")  # tables with a part of their own at the end
 COMPLETE = "Nothing: every planned run is finished."
 DRAWN = "rhmc drawings"
@@ -270,7 +273,10 @@ def _last(results: Results) -> dict[str, Table]:
 
 
 def _study_tables(results: Results, study: str) -> dict[str, Table]:
-    """The tables that every study has."""
+    """The tables that a study has. One with readings has too many arms for those that compare each pair."""
+    if results.has_readings(study):
+        made = readings.tables(results, study) | {"final": tables.finals(results, study)}
+        return {f"{name}_{stem(study)}": table for name, table in made.items()}
     found = scaling.sweep(results, study)
     steadiness = tables.steadiness(results, study)
     every: dict[str, Table | None] = {

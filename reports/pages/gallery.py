@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import NamedTuple
 
-from reports.analyses import beyond, comparison, scaling
+from reports.analyses import beyond, comparison, readings, scaling
 from reports.analyses.scaling import Sweep
 from reports.data.drawn import Counterexample, Scenes
 from reports.data.escaping import stem
@@ -64,6 +64,9 @@ def gallery(results: Results, paper: Paper) -> list[Picture]:
     drawn = [*_networks(results), *_states(results), *_scaling(results), *_counterexamples(results)]
     known = {spec.study: name for name, spec in paper.figures.items()}
     for study in results.studies:
+        if results.has_readings(study):
+            drawn += _readings(results, study)
+            continue
         spec = paper.figures[known[study]] if study in known else paper.curves_of(study, results.task(study))
         drawn += _curves(results, spec, known.get(study, f"curves_{stem(study)}"))
     own = sorted((p for p in drawn if p.name.startswith(PAPERS)), key=lambda p: _order(p.name))
@@ -90,6 +93,8 @@ def in_short(results: Results, paper: Paper) -> list[str]:
 
 def study_gallery(results: Results, paper: Paper, study: str) -> list[Picture]:
     """The figures of one study."""
+    if results.has_readings(study):
+        return list(_readings(results, study))
     spec = paper.curves_of(study, results.task(study))
     return [
         *_curves(results, spec, f"curves_{stem(study)}"),
@@ -101,6 +106,8 @@ def study_gallery(results: Results, paper: Paper, study: str) -> list[Picture]:
 def comparisons(results: Results) -> Iterator[Picture]:
     """Figures that the paper lacks: assignments, performance profiles, probabilities of improvement, transfer."""
     for study in results.studies:
+        if results.has_readings(study):
+            continue
         made = f"rhmc assignments studies/{study.partition('@')[0]}.yaml --profile {results.profile}"
         title = f"What is assigned while training, study {study}"
         name = stem(study)
@@ -111,6 +118,25 @@ def comparisons(results: Results) -> Iterator[Picture]:
         yield from picture(f"better_{name}", title, partial(_better, results, study), study)
     title = "Trained once, played with other numbers"
     yield from picture("transfer", title, lambda: _moved(results), "-", "rhmc transfer")
+
+
+def _readings(results: Results, study: str) -> Iterator[Picture]:
+    """The specification curve of each contrast."""
+    for found in readings.contrasts(results, study):
+        title = f"Whole method less '{found.without}', by reading, study {study}"
+        name = f"readings_{stem(found.without)}_{stem(study)}"
+        yield from picture(name, title, partial(_specification, results, study, found), study)
+
+
+def _specification(results: Results, study: str, found: readings.Contrast) -> Made | None:
+    drawing = readings.fig_curve(results, study, found)
+    holds = int((found.effects > 0).sum())
+    caption = (
+        f"Every mark is one reading of the paper: right of the zero crossing the paper's order holds ({holds} of "
+        f"{len(found.effects)}). See which levels crowd at one end: these decide."
+    )
+    alt = f"Effects of {len(found.effects)} readings with intervals, and the level of each factor under each."
+    return (caption, alt, drawing) if drawing else None
 
 
 def _assigned(results: Results, study: str) -> Made | None:

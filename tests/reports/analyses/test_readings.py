@@ -1,15 +1,21 @@
 """Specification curves against effects that were planted, level by level."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.colors import to_hex
 
 from reports.analyses import readings
+from reports.data.escaping import stem
 from reports.data.frame import Results, load
+from reports.data.paper import read as paper
+from reports.pages import build, gallery
+from reports.render.canvas import QUIET
 from tests.reports.factory import study, write, yardsticks
 
 FACTORS = {"alpha": ("0.02", "0.3", "1", "0.1"), "encoder": ("mlp", "pairwise"), "lr": ("0.001", "0.0005")}
@@ -163,3 +169,49 @@ def test_main_effects_as_a_table(tmp_path: Path) -> None:
     assert len(table.shown) == 8
     assert set(table.shown["Without"]) == {"no regulation"}
     assert list(table.shown["Factor"].unique()) == list(FACTORS)
+
+
+def test_the_figure_has_every_reading_in_the_order_of_the_table(tmp_path: Path) -> None:
+    results = read(tmp_path, by_alpha)
+    found = one(results)
+    drawing = readings.fig_curve(results, "read", found)
+    assert drawing is not None
+    upper, lower = drawing.figure.axes
+    (marks,) = upper.collections[-1:]
+    heights = np.asarray(marks.get_offsets())[:, 1]
+    assert list(heights) == sorted(found.effects)
+    assert list(drawing.numbers["effect"]) == list(heights)
+    rows = [label.get_text() for label in lower.get_yticklabels()]
+    assert rows == [f"{factor}: {level}" for factor, levels in FACTORS.items() for level in levels]
+    for row, mark in enumerate(lower.collections):
+        factor, level = rows[row].split(": ")
+        places = np.asarray(mark.get_offsets())[:, 0].astype(int)
+        assert list(drawing.numbers[factor].iloc[places].unique()) == [level]
+        assert len(places) == (drawing.numbers[factor] == level).sum()
+
+
+def test_colours_say_on_which_side_of_zero_an_interval_is(tmp_path: Path) -> None:
+    results = read(tmp_path, lambda alpha, encoder, lr: {"0.02": -9.0, "0.1": 0.5, "0.3": 9.0, "1": 9.0}[alpha])
+    drawing = readings.fig_curve(results, "read", one(results))
+    assert drawing is not None
+    edges = [to_hex(colour) for colour in drawing.figure.axes[0].collections[-1].get_edgecolors()]
+    assert edges == [readings.WORSE.lower()] * 4 + [to_hex(QUIET)] * 4 + [readings.BETTER.lower()] * 8
+
+
+def test_a_study_with_readings_has_its_own_tables_and_figures(tmp_path: Path) -> None:
+    results = read(tmp_path, by_alpha)
+    names = set(build._study_tables(results, "read"))
+    assert names == {"effects_read", "factors_read", "readings_read", "final_read"}
+    pictures = gallery.study_gallery(results, paper(), "read")
+    assert [one.name for one in pictures] == [f"readings_{stem('no regulation')}_read"]
+    assert "(12 of 16)" in pictures[0].caption
+    listed = readings.tables(results, "read")["readings"]
+    assert list(listed.shown["Without"].unique()) == ["no regulation"]
+    assert len(listed.numbers) == 16
+
+
+def test_nothing_is_shown_before_a_reading_is_finished(tmp_path: Path) -> None:
+    results = read(tmp_path, by_alpha)
+    none = replace(results, points=results.points[results.points["metric"] != "final/return"])
+    assert readings.tables(none, "read") == {}
+    assert readings.fig_curve(none, "read", one(none)) is None
