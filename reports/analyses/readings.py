@@ -187,8 +187,8 @@ def fig_curve(results: Results, study: str, found: Contrast) -> Drawing | None:
         _draw_levels(lower, table, lines)
         foot(
             figure,
-            "points of final return with 95 % intervals from the pooled variance; blue above zero, orange below; hollow: "
-            "an arm learned nothing",
+            "points of final return with 95 % intervals from the pooled variance; blue above zero, orange below; "
+            "hollow: an arm learned nothing",
         )
     return Drawing(figure, table)
 
