@@ -1,1 +1,1 @@
-"""The command `rhmc`, a module for each noun; no work is done here, a verb imports what does it."""
+"""The command `rhmc`, a module for each noun; a verb imports what does the work, and turns the outcome into an exit code."""
