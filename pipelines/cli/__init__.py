@@ -1,1 +1,1 @@
-"""The command `rhmc`, a module for each noun; a verb imports what does the work, and turns the outcome into an exit code."""
+"""The command `rhmc`, a module for each noun; a verb imports what works, and makes an exit code of the outcome."""
