@@ -8,7 +8,7 @@ linear model without interactions. A reading under which an arm learned nothing 
 """
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -22,6 +22,8 @@ from reports.render.canvas import FAINT, QUIET, Drawing, blank, foot, head, styl
 from reports.render.tables import NONE, Table, describe_task, estimate, number, percent
 
 RESAMPLES = 9_999  # swaps of labels
+# Of the readings. By chance an interval is above zero in one of 40, and below in as many.
+MOST, SOME, FEW = 2 / 3, 1 / 8, 1 / 20
 NOTHING = "random"  # the yardstick that has learned nothing
 TOLERANCE = 2.0  # points above it that are nothing still
 # Inches: width, height of the upper axes, of a row of levels, of what is above and below, and of the words on the left
@@ -59,6 +61,30 @@ class Fit(NamedTuple):
 
     levels: pd.DataFrame  # factor, level, readings, and the effect there with its interval
     factors: pd.DataFrame  # factor, f, p and p corrected for the number of factors
+
+
+Outcome = Literal["holds", "depends on the reading", "not shown", "reversed"]
+
+
+def outcome(found: Contrast) -> Outcome:
+    """The verdict on the paper's order, by the readings whose interval is above zero, and below.
+
+    Holds: above in `MOST` or more, and below in `FEW` or fewer. Reversed: the same with the sides exchanged. Depends on
+    the reading: above in more than `SOME`, and neither. Not shown: what is left.
+    """
+    ranges = intervals(found)
+    above, below = (float(np.mean(sides)) for sides in ([x.above(0) for x in ranges], [x.below(0) for x in ranges]))
+    if above >= MOST and below <= FEW:
+        return "holds"
+    if below >= MOST and above <= FEW:
+        return "reversed"
+    return "depends on the reading" if above > SOME else "not shown"
+
+
+def deciding(found: Contrast) -> list[str]:
+    """The factors that change the effect, after Holm's correction over all factors; the smallest p first."""
+    table = fitted(found).factors.sort_values("p_corrected", kind="stable")
+    return [str(name) for name in table[table["p_corrected"] < 1 - LEVEL]["factor"]]
 
 
 def contrasts(results: Results, study: str) -> list[Contrast]:
@@ -298,6 +324,7 @@ def summary(results: Results, study: str) -> Table:
         full, other = (unlearned(results, study, x) for x in (found.full, found.other))
         rows.append(
             {"without": found.without, "readings": len(effects), "missing": found.missing}
+            | {"outcome": outcome(found), "deciding": ", ".join(deciding(found))}
             | {"holds": (effects > 0).mean(), "clear": np.mean([x.above(0) for x in ranges])}
             | {"reversed": np.mean([x.below(0) for x in ranges])}
             | {"median": median, "lower_quartile": quarter, "upper_quartile": three, "p": permuted(found)}
@@ -307,11 +334,20 @@ def summary(results: Results, study: str) -> Table:
     numbers = pd.DataFrame(rows)
     shown = pd.DataFrame([_summarised(row) for row in rows])
     note = (
-        "Holds: the whole method is better. Clear, reversed: the interval of the reading is above, below zero. p: "
+        "Order holds: the whole method is better. Clear, reversed: the interval of the reading is above, below zero. "
+        f"Outcome: `holds` where it is clear in {percent_of(MOST)} of the readings or more and reversed in "
+        f"{percent_of(FEW)} or fewer; `reversed` the other way round; else `depends on the reading` where it is "
+        f"clear in more than {percent_of(SOME)}, and `not shown` below. Deciding factors: p < {1 - LEVEL:.2f} "
+        "in the F test, corrected for the number of factors. p: "
         f"permutation test of the median effect, {RESAMPLES:,} resamples. Learned nothing: at most {TOLERANCE:g} "
         "points above the random policy; such readings count."
     )
     return Table(f"Effects over the readings of study {study}", numbers, shown, note)
+
+
+def percent_of(share: float) -> str:
+    """A share in words."""
+    return f"{100 * share:.3g} %"
 
 
 def _summarised(row: Mapping[str, Any]) -> dict[str, str]:
@@ -321,6 +357,8 @@ def _summarised(row: Mapping[str, Any]) -> dict[str, str]:
     return {
         "Without": row["without"],
         "Readings": str(row["readings"]),
+        "Outcome": row["outcome"],
+        "Deciding factors": row["deciding"] or NONE,
         "Order holds": share["holds"],
         "clear": share["clear"],
         "reversed": share["reversed"],

@@ -215,3 +215,41 @@ def test_nothing_is_shown_before_a_reading_is_finished(tmp_path: Path) -> None:
     none = replace(results, points=results.points[results.points["metric"] != "final/return"])
     assert readings.tables(none, "read") == {}
     assert readings.fig_curve(none, "read", one(none)) is None
+
+
+def judged(above: int, below: int, of: int = 48) -> readings.Contrast:
+    """A contrast with so many readings clearly above zero and below; the rest are at zero."""
+    effects = np.repeat([10.0, -10.0, 0.0], [above, below, of - above - below])
+    other = np.tile(SEEDS, (of, 1))
+    levels = pd.DataFrame({"alpha": ["1"] * above + ["0"] * (of - above)})
+    return readings.Contrast("no regulation", levels, other + effects[:, None], other, 0)
+
+
+@pytest.mark.parametrize(
+    ("above", "below", "said"),
+    [
+        (48, 0, "holds"),
+        (32, 2, "holds"),  # 2 of 48 are fewer than a twentieth, 3 are more
+        (32, 3, "depends on the reading"),
+        (31, 0, "depends on the reading"),
+        (7, 0, "depends on the reading"),
+        (6, 0, "not shown"),  # an eighth
+        (0, 0, "not shown"),
+        (7, 41, "depends on the reading"),
+        (6, 31, "not shown"),
+        (2, 32, "reversed"),
+        (3, 32, "not shown"),
+        (2, 31, "not shown"),
+    ],
+)
+def test_each_outcome_on_either_side_of_its_thresholds(above: int, below: int, said: str) -> None:
+    assert readings.outcome(judged(above, below)) == said
+
+
+def test_the_deciding_factors_are_those_that_change_the_effect(tmp_path: Path) -> None:
+    found = one(read(tmp_path, by_alpha, noise=0.1))
+    assert readings.deciding(found) == ["alpha", "encoder"]
+    flat = one(read(tmp_path / "flat", lambda *levels: 3.0, noise=1.0))
+    assert readings.deciding(flat) == []
+    table = readings.summary(read(tmp_path / "again", by_alpha, noise=0.1), "read")
+    assert table.shown[["Outcome", "Deciding factors"]].to_numpy().tolist() == [["holds", "alpha, encoder"]]
