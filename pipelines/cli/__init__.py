@@ -1,1 +1,1 @@
-"""The command `rhmc`, a module for each noun; a verb imports what works, and makes an exit code of the outcome."""
+"""The command `rhmc`, a module for each noun; no work is done here, a verb makes an exit code of what others do."""
