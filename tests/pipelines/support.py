@@ -21,14 +21,14 @@ from pipelines.workspace.process_pool import side_by_side
 from rhmc.algorithms import ALGORITHMS
 from tests.blocks import fitted, nested
 
-CODE = code_id("iql", "coverage")  # of all runs here
+CODE = code_id("iql", "navigation")  # of all runs here
 
 
 def setting(**algo: Any) -> Setting:
-    """Coverage with two sensors and IQL, a fraction of a second of training."""
+    """Navigation with two agents and IQL, a fraction of a second of training: most of it is play, so episodes are short."""
     return Setting.model_validate(
         {
-            "env": {"kind": "coverage", "preset": "flat", "agents": 2, "targets": 2},
+            "env": {"kind": "navigation", "agents": 2, "episode": 7},
             "algo": {
                 "kind": "iql",
                 "learning_starts": 64,
