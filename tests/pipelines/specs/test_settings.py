@@ -19,7 +19,7 @@ STUDIES = ROOT / "studies"
 FILES = sorted(path for path in STUDIES.rglob("*.yaml") if path.parent.name != "best_params")  # searches write those
 ALIKE = 3  # settings that two sections may share by chance
 LINES = 400
-READ = 50  # lines of a study with readings, which spells out the levels of its factors
+READ = 60  # lines of a study with readings, which spells out the levels of its factors
 
 
 def document(path: Path) -> dict[str, Any]:
