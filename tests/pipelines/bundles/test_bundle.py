@@ -32,7 +32,7 @@ from pipelines.tracking.mlflow_tracker import MlflowTracker, open_existing
 from pipelines.tracking.plan import items, study_card
 from pipelines.tracking.policy import SPEC, load
 from pipelines.workspace import leftovers
-from pipelines.workspace.errors import InputError
+from pipelines.workspace.errors import InputError, visible
 from pipelines.workspace.work_folder import Checkpoints, Home, StoreError, load_whole, save_atomically, without_replay
 from rhmc.training.trainer import Config, Trainer, grid_step
 from tests.depth import often
@@ -669,7 +669,7 @@ def assert_refused(bundle: Path, there: Path, said: str) -> None:
         unpack(bundle, there)
     text = str(error.value)
     assert text.startswith(f"{bundle}: ")
-    assert text.isprintable()
+    assert visible(text) == text
     assert len(text) < 600
     assert picture(there) == before
 
@@ -863,7 +863,7 @@ def settle(bundle: Path, home: Path) -> None:
     except StoreError as error:
         said = str(error)
     if said:
-        assert said.isprintable()
+        assert visible(said) == said
         assert picture(home) == before
     else:
         assert (taken.new + taken.known, taken.begun) in {(2, 1), (2, 0)}

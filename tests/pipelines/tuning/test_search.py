@@ -899,7 +899,7 @@ def test_a_killed_and_interrupted_search_ends_as_one_that_was_not(
     wait_for(work, lambda: bool(list(work.glob("checkpoints/*/0*.pt"))), process)
     process.kill()
     process.wait()
-    assert all_end(process.pid, "ray::")  # else one still saves a point, which `interrupt` takes for the launch below
+    assert all_end(process.pid, "ray::Worker")  # else one saves a point, which `interrupt` takes for the next launch's
     assert show_search(search, work) == 1
     threading.Thread(target=interrupt, args=(work,)).start()
     assert run_search(search, work, work / "out") == 130
