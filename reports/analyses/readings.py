@@ -7,7 +7,7 @@ share one variance, pooled over arms and readings, as two seeds have none of the
 linear model without interactions. A reading under which an arm learned nothing counts like any other, and is marked.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -18,7 +18,7 @@ from scipy.stats import f, permutation_test, t
 
 from reports.data.frame import FINAL, ORDER, Results
 from reports.data.stats import LEVEL, SEED, Interval, holm
-from reports.render.canvas import FAINT, QUIET, Drawing, blank, foot, head, styled
+from reports.render.canvas import BLUE, FAINT, ORANGE, QUIET, Drawing, blank, foot, head, styled
 from reports.render.tables import NONE, Table, describe_task, estimate, number, percent
 
 RESAMPLES = 9_999  # swaps of labels
@@ -28,7 +28,7 @@ NOTHING = "random"  # the yardstick that has learned nothing
 TOLERANCE = 2.0  # points above it that are nothing still
 # Inches: width, height of the upper axes, of a row of levels, of what is above and below, and of the words on the left
 WIDE, TALL, ROW, ABOVE, BELOW, BESIDE = 9.6, 2.4, 0.145, 0.75, 0.55, 2.4
-BETTER, WORSE = "#0072B2", "#D55E00"  # of effects whose interval is above, below zero
+BETTER, WORSE = BLUE, ORANGE  # of effects whose interval is above, below zero
 
 Values = NDArray[np.float64]
 
@@ -256,6 +256,11 @@ def _draw_levels(axes: Axes, table: pd.DataFrame, lines: list[tuple[str, str]]) 
 
 # Tables
 
+NOTE = (
+    "Effect: mean final return of the whole method less that of the arm; above zero the paper's order holds. All "
+    "intervals have one width, from the variance pooled over readings and arms."
+)
+
 
 def tables(results: Results, study: str) -> dict[str, Table]:
     """All tables of a study, by kind; none as long as no reading is finished."""
@@ -265,20 +270,22 @@ def tables(results: Results, study: str) -> dict[str, Table]:
     return {
         "effects": summary(results, study),
         "factors": main_effects(results, study),
-        "readings": joined_curves([curve(results, study, one) for one in found], [one.without for one in found], study),
+        "readings": curves(results, study, found),
     }
 
 
-def joined_curves(curves: list[Table], withouts: list[str], study: str) -> Table:
-    """The curves of all contrasts in one table."""
+def curves(results: Results, study: str, found: Sequence[Contrast]) -> Table:
+    """The curves of all contrasts in one table; `arm` is what each is without."""
+    each = {one.without: curve(results, study, one) for one in found}
     numbers, shown = (
-        pd.concat(
-            [getattr(one, name).assign(**{key: w}) for one, w in zip(curves, withouts, strict=True)], ignore_index=True
+        pd.concat(parts, names=[column]).reset_index(level=0).reset_index(drop=True)
+        for column, parts in (
+            ("arm", {arm: table.numbers for arm, table in each.items()}),
+            ("Without", {arm: table.shown for arm, table in each.items()}),
         )
-        for name, key in (("numbers", "without"), ("shown", "Without"))
     )
-    shown = shown[["Without", *(name for name in shown if name not in ("Without", "Full", "without"))]]
-    return Table(f"Effects by reading, study {study}", numbers, shown, curves[0].note)
+    missing = (f" Without '{one.without}': {_missing(one)}" for one in found if one.missing)
+    return Table(f"Effects by reading, study {study}", numbers, shown, NOTE + "".join(missing))
 
 
 def curve(results: Results, study: str, found: Contrast) -> Table:
@@ -295,19 +302,18 @@ def curve(results: Results, study: str, found: Contrast) -> Table:
         {
             "Reading": numbers["reading"].str.removeprefix("reading="),
             "Effect [95 %]": [estimate(ranges[i]) for i in order],
-            "Full": numbers["full"].map(number),
-            "Without": numbers["without"].map(number),
+            "Mean, full": numbers["full"].map(number),
+            "Mean, without": numbers["without"].map(number),
             "Learned nothing": [_idle(row) for row in numbers[list(idle)].to_numpy(bool)],
         }
     )
     shown = pd.concat([shown, numbers[list(found.levels.columns)]], axis=1)
-    note = (
-        "Effect: mean final return of the whole method less that of the arm; above zero the paper's order holds. All "
-        "intervals have one width, from the variance pooled over readings and arms."
-    )
-    if found.missing:
-        note += f" {found.missing} more readings are not finished."
+    note = f"{NOTE} {_missing(found)}" if found.missing else NOTE
     return Table(f"Effect of what '{found.without}' is without, by reading, study {study}", numbers, shown, note)
+
+
+def _missing(found: Contrast) -> str:
+    return f"{found.missing} more readings are not finished."
 
 
 def _idle(row: NDArray[np.bool_]) -> str:

@@ -210,6 +210,19 @@ def test_a_study_with_readings_has_its_own_tables_and_figures(tmp_path: Path) ->
     assert len(listed.numbers) == 16
 
 
+def test_the_table_of_all_contrasts_has_what_the_table_of_each_has(tmp_path: Path) -> None:
+    results = read(tmp_path, by_alpha, drop="no regulation, reading=111")
+    found = one(results)
+    both = readings.curves(results, "read", [found, found._replace(without="no filter", missing=0)])
+    single = readings.curve(results, "read", found)
+    for place, arm in enumerate(("no regulation", "no filter")):
+        part = slice(15 * place, 15 * place + 15)
+        assert set(both.numbers["arm"][part]) == set(both.shown["Without"][part]) == {arm}
+        for whole, key, own in ((both.numbers, "arm", single.numbers), (both.shown, "Without", single.shown)):
+            pd.testing.assert_frame_equal(whole[part].drop(columns=key).reset_index(drop=True), own)
+    assert both.note.endswith("Without 'no regulation': 1 more readings are not finished.")
+
+
 def test_nothing_is_shown_before_a_reading_is_finished(tmp_path: Path) -> None:
     results = read(tmp_path, by_alpha)
     none = replace(results, points=results.points[results.points["metric"] != "final/return"])
