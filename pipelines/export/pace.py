@@ -35,7 +35,7 @@ def estimated(study: Study, folder: Path) -> str:
 
 
 def paces(folder: Path) -> dict[str, float]:
-    """Environment steps per second of training: the median over the finished runs of each method.
+    """Environment steps per processor second of training: the median over the finished runs of each method.
 
     Tables that cannot be read count for nothing.
     """

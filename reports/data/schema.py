@@ -24,7 +24,7 @@ MADE = pa.schema(  # the runs that are there: how and where each was made
     [
         *PLACE,
         ("commit", WORDS),
-        ("seconds", NUMBER),  # spent training
+        ("seconds", NUMBER),  # of processor time, spent training
         ("machine", WORDS),
         ("versions", WORDS),
         ("adopted", WORDS),  # from which code, where older code made it
