@@ -26,7 +26,7 @@ def export_study(study: Study, out: Path, home: Path | None = None) -> int:
     """Write `<study>.parquet` (schema `METRICS`), `<study>.runs.parquet` (`RUNS`), `<study>.made.parquet` (`MADE`).
 
     A study with readings also has `<study>.readings.parquet` (`READINGS`).
-    Only runs of the present plan and code are taken; `time/` metrics stay behind, but for the processor seconds of a run.
+    Only runs of the present plan and code are taken; `time/` metrics stay behind, but for a run's processor seconds.
 
     Args:
         study: the plan.

@@ -22,6 +22,7 @@ from rhmc.hierarchy import attention, executor
 from rhmc.learning import checkpoint
 from rhmc.learning.experience import Experience
 from rhmc.learning.learner import Learners, Replay, choose, pack
+from rhmc.learning.schedules import linear
 from rhmc.learning.settings import Replayed
 from rhmc.types import Batch, Carry, Obs, Spec, State, Transition
 
@@ -41,6 +42,13 @@ class Executor(executor.Settings):
     """The block `executor`: actors only."""
 
     method: Literal["gumbel", "expected"] = Field("expected", description="as in `rhmc.hierarchy.executor`")
+    final_lr_fraction: float | None = Field(
+        None,
+        ge=0,
+        le=1,
+        description="share of their step size that is left at the end of `pretrain` (linear) instead "
+        "of the trainer's schedule, which they leave early",
+    )
 
 
 class Config(attention.Config, executor.Config, Replayed):
@@ -112,12 +120,20 @@ class HiTMAC:
         """The executors' updates that are due; when they are frozen, all epochs of the coordinator's full rollout."""
         logs: Batch = {}
         for rows in self.practised.due():
+            self._anneal()
             logs = self.executor.update(rows)
         if not self.practising:
             self.practised.replay = Replay(self.cfg.buffer_size, self.rng)  # of no more use
             rollout = self.decisions.take()
             logs |= self.coordinator.learn(rollout) if rollout else {}
         return logs
+
+    def _anneal(self) -> None:
+        final = self.cfg.executor.final_lr_fraction
+        if final is None:
+            return  # as the trainer says
+        for learner in self.executor.learners():
+            learner.anneal(linear(1.0, final, self.cfg.pretrain, self.practised.steps))
 
     def learners(self) -> Learners:
         """The learners of both levels."""

@@ -126,7 +126,8 @@ class Coordinator:
         The value after a period that an episode's end shortened is discounted by the period's share of a whole one.
         """
         value, next_values = values(lambda obs: self.standardiser.value(self._output(obs)), rows)
-        next_values = next_values * self.cfg.gamma ** (rows["length"] / self.period - 1)
+        if self.cfg.gamma:  # `gae` multiplies by gamma once more; without a discount it leaves nothing
+            next_values = next_values * self.cfg.gamma ** (rows["length"] / self.period - 1)
         flags = rows["terminated"], rows["done"]
         advantage = gae(rows["reward"], value, next_values, *flags, self.cfg.gamma, self.cfg.gae_lambda)
         data = flat(rows | {"advantage": advantage, "target": value + advantage})

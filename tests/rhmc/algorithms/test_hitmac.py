@@ -219,6 +219,15 @@ def test_returns_of_decisions_by_hand(terminated: bool) -> None:
     assert data["advantage"].sign().tolist() == ([1, -1] if first > second else [-1, 1])
 
 
+def test_without_a_discount_a_cut_period_counts_its_reward_alone() -> None:
+    algo = HiTMAC(config(gamma=0.0), SPEC, 1, seeded())
+    flat_value(algo, 8.0)
+    play(algo, [1.0, 2.0, 3.0, 4.0, 5.0], truncated=True)
+    rows = algo.decisions.take()
+    assert rows is not None
+    assert algo.coordinator.judge(rows)["target"].tolist() == pytest.approx([(1 + 2 + 3) / 3, (4 + 5) / 3])
+
+
 def test_half_a_lambda_mixes_in_the_critics_word() -> None:
     algo = HiTMAC(config(gae_lambda=0.5), SPEC, 1, seeded())
     flat_value(algo, 8.0)
@@ -375,6 +384,26 @@ def test_executors_learn_first_and_are_frozen_then() -> None:
     assert all(state["practised"]["replay"]["size"] == 0 for state in states[turn:])
     assert all(state["practised"]["steps"] == 92 for state in states[turn:])
     assert states[-1]["practised"]["updates"] == (92 - 8) // 4
+
+
+@pytest.mark.parametrize("final", [None, 0.2])
+def test_the_executors_step_size_may_fall_within_their_own_phase(final: float | None) -> None:
+    """Their last update is at step 92 of 160; without a schedule of their own they leave the trainer's there."""
+    run = trainer(**{"executor.final_lr_fraction": final})
+    run.cfg = run.cfg.model_copy(update={"final_lr_fraction": 0.5})
+    sizes, update = [], run.algorithm.executor.update
+
+    def spy(rows: Batch) -> Batch:
+        groups = [learner.optimiser.param_groups[0]["lr"] for learner in run.algorithm.learners()]
+        sizes.append((run.step, *(size / run.algorithm.cfg.lr for size in groups)))
+        return update(rows)
+
+    run.algorithm.executor.update = spy
+    list(run)
+    for step, coordinator, _, actor, critic in sizes:
+        assert coordinator == pytest.approx(1 - 0.5 * step / 160)
+        assert actor == critic == pytest.approx(coordinator if final is None else 1 - 0.8 * (step + 4) / 92)
+    assert sizes[-1][0] + 4 == 92
 
 
 def test_frozen_executors_act_greedily_for_the_coordinator() -> None:
