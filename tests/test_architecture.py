@@ -66,7 +66,7 @@ ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
         "data": (),
         "render": ("data",),
         "analyses": ("data", "render"),
-        "claims": ("data", "render"),
+        "claims": ("data", "render", "analyses"),
         "pages": ("data", "render", "analyses", "claims"),
     },
 }

@@ -72,13 +72,18 @@ def outcome(found: Contrast) -> Outcome:
     Holds: above in `MOST` or more, and below in `FEW` or fewer. Reversed: the same with the sides exchanged. Depends on
     the reading: above in more than `SOME`, and neither. Not shown: what is left.
     """
-    ranges = intervals(found)
-    above, below = (float(np.mean(sides)) for sides in ([x.above(0) for x in ranges], [x.below(0) for x in ranges]))
+    above, below = sides(found)
     if above >= MOST and below <= FEW:
         return "holds"
     if below >= MOST and above <= FEW:
         return "reversed"
     return "depends on the reading" if above > SOME else "not shown"
+
+
+def sides(found: Contrast) -> tuple[float, float]:
+    """The shares of the readings whose interval is above zero, and below."""
+    ranges = intervals(found)
+    return float(np.mean([x.above(0) for x in ranges])), float(np.mean([x.below(0) for x in ranges]))
 
 
 def deciding(found: Contrast) -> list[str]:

@@ -12,9 +12,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple, TypeVar
 
-from reports import claims as rules
 from reports.analyses import beyond, comparison, readings, scaling
-from reports.claims import VERDICTS, Claim
+from reports.claims import verdicts as rules
+from reports.claims.verdicts import ENOUGH, SHORT, VERDICTS, Claim
 from reports.data.escaping import code, markdown, prose, stem, words
 from reports.data.frame import Results, TableError, load, mixed
 from reports.data.paper import Paper, PaperError, read
@@ -55,7 +55,13 @@ DEFINITIONS = (
         "interval. A bootstrap would say [0, 0] or [1, 1] where every seed of one arm wins. Three seeds that all win "
         "against three can show no more than [0.50, 1.00].",
     ),
-    ("provisional", f"the verdict rests on less than the paper's training budget or on fewer than {FEW} seeds."),
+    (
+        "provisional",
+        f"the verdict rests on less than {readings.percent_of(ENOUGH)} of the paper's training budget, on fewer than "
+        f"{FEW} seeds, on unfinished runs, or on one reading of the text.",
+    ),
+    ("depends on the reading", "what the text leaves open decides it: the specification curve has the factors."),
+    ("too short to judge", f"the runs have less than {readings.percent_of(SHORT)} of the paper's training budget."),
 )
 
 
@@ -82,6 +88,7 @@ class Report(NamedTuple):
     claims: list[Claim]
     gaps: list[str]
     short: list[str]  # what came out, a sentence a figure of the paper
+    smoke: str = ""  # a warning that the runs are too short
 
 
 class OutError(ValueError):
@@ -184,7 +191,17 @@ def _whole(results: Results, paper: Paper) -> Report:
     title = f"Does it hold? The paper's results, profile {results.profile}"
     pictures, claims = gallery(results, paper), rules.judge(results, paper)
     made = _tables(results, paper)
-    return Report(results, title, _lead(results), pictures, made, claims, gaps, in_short(results, paper))
+    return Report(
+        results,
+        title,
+        _lead(results),
+        pictures,
+        made,
+        claims,
+        gaps,
+        in_short(results, paper),
+        rules.smoke_test(results, paper),
+    )
 
 
 def _single(results: Results, paper: Paper, study: str) -> Report:
@@ -192,7 +209,17 @@ def _single(results: Results, paper: Paper, study: str) -> Report:
     made = _study_tables(results, study) | _last(own)
     title = f"Study {study}, profile {results.profile}"
     lead = f"{_question(results, study)} {_lead(results)}"
-    return Report(results, title, lead, study_gallery(results, paper, study), made, [], results.gaps({}), [])
+    return Report(
+        results,
+        title,
+        lead,
+        study_gallery(results, paper, study),
+        made,
+        [],
+        results.gaps({}),
+        [],
+        rules.smoke_test(own, paper),
+    )
 
 
 def definitions(results: Results) -> list[tuple[str, str]]:
@@ -301,8 +328,8 @@ def _index(report: Report) -> Iterator[str]:
     results = report.results
     yield f"# {markdown(report.title)}\n"
     yield "The same with everything in one page: `index.html`.\n"
-    if results.set_aside:
-        yield f"**{results.set_aside}**\n"
+    for warning in filter(None, (report.smoke, results.set_aside)):
+        yield f"**{warning}**\n"
     yield f"{_summary(results)}\n"
     if report.short:
         yield "\n".join(f"- {markdown(line)}" for line in report.short) + "\n"
@@ -357,7 +384,7 @@ def _content(report: Report, pictures: Path) -> Mapping[str, Any]:
     return {
         "title": report.title,
         "lead": report.lead,
-        "aside": words(results.set_aside),
+        "warnings": [words(text) for text in (report.smoke, results.set_aside) if text],
         "short": report.short,
         "folded": page.FOLDED,
         "tally": page.verdicts(report.claims),

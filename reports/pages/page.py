@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from reports.claims import JUDGED, VERDICTS, Claim, described
+from reports.claims.verdicts import JUDGED, VERDICTS, Claim, described
 from reports.data.escaping import stem
 from reports.data.frame import TOLD, Results, adopted
 from reports.pages.gallery import Picture
@@ -28,8 +28,9 @@ EPISODE_WORDS: Mapping[str, str] = {
 UNITS = {"": 1.0, "k": 1e3, "M": 1e6}
 MARKS: Mapping[str, str] = {  # a sign for each verdict, beside its colour
     "reproduced": "✓",
-    "partly": "◐",
+    "depends on the reading": "◐",
     "not reproduced": "✗",
+    "too short to judge": "…",
     "untestable": "?",
     "contradicted by the paper itself": "⚡",
 }

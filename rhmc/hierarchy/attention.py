@@ -113,7 +113,7 @@ class Coordinator:
         return drawn, likelihood(logits, drawn)
 
     def learn(self, rollout: Batch) -> Batch:
-        """All epochs on a rollout: rows (T, B, ...) as `decisions` of `rhmc.algorithms.hitmac` keeps them."""
+        """All epochs on a rollout: rows (T, B, ...) as `rhmc.hierarchy.decisions` keeps them."""
         logs: Batch = {}
         for rows in minibatches(self.judge(rollout), self.cfg.epochs, self.cfg.minibatches, self.rng):
             logs = self.improve(rows)

@@ -117,11 +117,12 @@ def test_index(made: Path) -> None:
 
 def test_claims_as_json(made: Path) -> None:
     found = {claim["id"]: claim for claim in json.loads((made / "claims.json").read_text())}
-    assert len(found) == 13
-    assert found["C8"]["verdict"] == "partly"
-    assert found["C8"]["provisional"] is True
-    assert found["C8"]["ours"]["full"]["value"] == pytest.approx(71.0)
-    assert found["C8"]["commands"] == [
+    assert len(found) == 23
+    assert found["C8a"]["verdict"] == "reproduced"
+    assert found["C8a"]["provisional"] is True
+    assert found["C8a"]["ours"]["full"]["value"] == pytest.approx(71.0)
+    assert found["C8b"]["verdict"] == "not reproduced"
+    assert found["C8a"]["commands"] == [
         "rhmc study run studies/ablation.yaml --profile quick && rhmc export studies/ablation.yaml --profile quick && "
         "rhmc report --profile quick"
     ]

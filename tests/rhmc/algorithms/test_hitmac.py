@@ -9,10 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Generator, Tensor, nn
 
-from rhmc.algorithms.hitmac import PRACTISED, Config, Decisions, HiTMAC, practice
+from rhmc.algorithms.hitmac import PRACTISED, Config, HiTMAC, practice
 from rhmc.envs import coverage, make_env
 from rhmc.envs.base import Env
 from rhmc.hierarchy.attention import Assigner, Contributions, Settings, likelihood, orders
+from rhmc.hierarchy.decisions import Decisions
 from rhmc.learning.learner import pack
 from rhmc.networks.nets import Sizes
 from rhmc.training.trainer import Config as Budget
