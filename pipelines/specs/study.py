@@ -45,6 +45,7 @@ from rhmc.training import trainer
 from rhmc.types import Frozen
 
 SECTIONS = ("env", "algo", "trainer")
+SPACE = "space"  # of a search's arm; it may include as sections do
 COUNTS = ("seeds", "steps")  # fields of a study that hold a number for each profile
 TABLES: dict[str, dict[str, type[Any]]] = {  # the configuration of every kind
     "env": {kind: task.config for kind, task in ENVS.items()},
@@ -365,7 +366,7 @@ def _trees(
     if crowded := _crowded(root):
         raise StudyError([*faults, *crowded])
     patches, found = _patches(root, overrides)
-    whole = [included(tree, path.parent, SECTIONS) for tree in (root, *patches)]
+    whole = [included(tree, path.parent, (*SECTIONS, SPACE)) for tree in (root, *patches)]
     faults += found + [fault for _, more in whole for fault in more]
     return whole[0][0], [tree for tree, _ in whole[1:]], faults
 

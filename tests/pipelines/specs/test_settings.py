@@ -11,7 +11,7 @@ from ruamel.yaml import YAML
 
 from pipelines.specs.safe_names import PROFILES
 from pipelines.specs.search import Search
-from pipelines.specs.study import SECTIONS, Study
+from pipelines.specs.study import SECTIONS, SPACE, Study
 from tests.test_architecture import is_search
 
 ROOT = Path(__file__).parents[3]
@@ -19,7 +19,7 @@ STUDIES = ROOT / "studies"
 FILES = sorted(path for path in STUDIES.rglob("*.yaml") if path.parent.name != "best_params")  # searches write those
 ALIKE = 3  # settings that two sections may share by chance
 LINES = 400
-READ = 60  # lines of a study with readings, which spells out the levels of its factors
+TRIED = 60  # lines of a file that spells out what is tried: the levels of factors, the arms and spaces of a search
 
 
 def document(path: Path) -> dict[str, Any]:
@@ -62,9 +62,9 @@ def test_a_block_that_stands_twice_is_found(tmp_path: Path) -> None:
 
 def test_the_studies_are_short() -> None:
     lines = {path: len(path.read_text(encoding="utf-8").splitlines()) for path in FILES}
-    read = [path for path in FILES if "readings" in document(path)]
-    assert sum(lines[path] for path in FILES if path not in read) < LINES
-    assert max(lines[path] for path in read) < READ
+    tried = [path for path in FILES if {"readings", "space", "trials"} & document(path).keys()]
+    assert sum(lines[path] for path in FILES if path not in tried) < LINES
+    assert max(lines[path] for path in tried) < TRIED
 
 
 def test_every_file_of_settings_is_included() -> None:
@@ -78,7 +78,7 @@ def written_out(tree: Any, section: str = "") -> Any:
     """A document with what it includes in its place; plain mappings, not the loader's."""
     if not isinstance(tree, dict):
         return tree
-    tree = {key: written_out(child, key if key in SECTIONS else "") for key, child in tree.items()}
+    tree = {key: written_out(child, key if key in (*SECTIONS, SPACE) else "") for key, child in tree.items()}
     if "include" not in tree:
         return tree
     name = str(tree.pop("include")).removesuffix(".yaml")

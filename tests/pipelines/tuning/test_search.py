@@ -257,6 +257,25 @@ def test_a_combination_that_the_method_refuses_is_found_in_the_check() -> None:
     load(changed("arms:\n", f"arms:\n{arm}".replace("[none, exact]", "[none]")))
 
 
+def test_arms_may_include_one_space() -> None:
+    Path("studies/spaces.yaml").write_text(
+        "space:\n  lr: {low: 1e-4, high: 1e-2, log: true}\n  gamma: {low: 0.5, high: 0.9}\n"
+    )
+    alike = "{algo: {kind: %s}, space: {include: spaces%s}}"
+    arms = f"  mine: {alike % ('ippo', '')}\n  other: {alike % ('mappo', ', gamma: {low: 0.8, high: 0.9}')}\n"
+    search = load(changed("arms:\n", f"arms:\n{arms}"))
+    assert [list(search.arms[name].space) for name in ("mine", "other")] == [["lr", "gamma"]] * 2
+    assert [search.arms[name].space["gamma"].low for name in ("mine", "other")] == [0.5, 0.8]
+    before = search.identity("mine"), search.sha256
+    Path("studies/spaces.yaml").write_text("space:\n  lr: {low: 1e-4, high: 2e-2}\n  gamma: {low: 0.5, high: 9}\n")
+    with pytest.raises(StudyError, match=r"^studies/spaces.yaml:3:28: arms.mine.space.gamma.high: 9 is not allowed; .*"):
+        load(changed("arms:\n", f"arms:\n  mine: {alike % ('ippo', '')}\n"))
+    Path("studies/spaces.yaml").write_text("space:\n  lr: {low: 1e-4, high: 2e-2}\n  gamma: {low: 0.5, high: 0.9}\n")
+    again = load(changed("arms:\n", f"arms:\n{arms}"))
+    assert again.identity("mine") != before[0]
+    assert again.sha256 != before[1]
+
+
 def test_a_study_is_no_search_and_a_search_no_study() -> None:
     load()
     with pytest.raises(StudyError, match=r"^studies/search_x.yaml:1:1: an arm has a space: a search, .* is no study$"):
