@@ -268,7 +268,7 @@ def test_arms_may_include_one_space() -> None:
     assert [search.arms[name].space["gamma"].low for name in ("mine", "other")] == [0.5, 0.8]
     before = search.identity("mine"), search.sha256
     Path("studies/spaces.yaml").write_text("space:\n  lr: {low: 1e-4, high: 2e-2}\n  gamma: {low: 0.5, high: 9}\n")
-    with pytest.raises(StudyError, match=r"^studies/spaces.yaml:3:28: arms.mine.space.gamma.high: 9 is not allowed; .*"):
+    with pytest.raises(StudyError, match=r"^studies/spaces.yaml:3:27: space.gamma.high: 9 is not allowed; .*"):
         load(changed("arms:\n", f"arms:\n  mine: {alike % ('ippo', '')}\n"))
     Path("studies/spaces.yaml").write_text("space:\n  lr: {low: 1e-4, high: 2e-2}\n  gamma: {low: 0.5, high: 0.9}\n")
     again = load(changed("arms:\n", f"arms:\n{arms}"))
