@@ -10,6 +10,7 @@ from torch import Generator, Tensor
 
 from pipelines.policies.animation import Panel, Scene, gif
 from pipelines.specs.document import choices
+from pipelines.specs.safe_names import MEASURES
 from pipelines.tracking import policy
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.leftovers import scratch
@@ -96,8 +97,7 @@ def play(env: EnvConfig, act: Act, episode: int, place: Callable[[Any], Any] | N
 
 
 def _told(score: dict[str, Tensor]) -> dict[str, Tensor]:
-    names = ("return", "coverage", "landmarks_covered", "collisions")
-    return {name: score[name] for name in names if name in score}
+    return {name: score[name] for name in MEASURES if name in score}
 
 
 def _words(name: str, value: float) -> str:

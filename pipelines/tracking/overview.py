@@ -11,6 +11,7 @@ from io import BytesIO, StringIO
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from pipelines.specs.safe_names import FINALS
 from pipelines.tracking import arm_colours
 from pipelines.tracking.plan import LISTED, Item, more
 from pipelines.tracking.tracker import Recorded, Row, Status, StudyCard, Tracker
@@ -23,12 +24,6 @@ if TYPE_CHECKING:
 
 PAUSE = 30.0  # seconds between two refreshes while a study runs
 CURVE, FINAL = "eval/return", "final/return"
-FINALS = {
-    FINAL: "return",
-    "final/coverage": "coverage",
-    "final/landmarks_covered": "landmarks covered",
-    "final/collisions": "collisions",
-}
 FIGURE, TABLE = "curves.png", "finals.csv"  # artifacts of the parent run
 LETTERS = 40  # of an arm's name on a line of the legend
 MOST = 12  # arms in the figure; more are not told apart

@@ -11,13 +11,12 @@ import zlib
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from pipelines.specs.safe_names import HEADLINES
+from pipelines.specs.safe_names import FINALS, HEADLINES
 from pipelines.tracking import arm_colours
 
 TAG = "mlflow.sharedViewState."
 STALE = "stale"  # the tag of runs that the latest plan of the study is without: other steps, other code
 RUNS = f"tags.role = 'run' and tags.{STALE} IS NULL"  # the parent run has no curves
-FINALS = ("final/return", "final/coverage", "final/landmarks_covered", "final/collisions")
 CURVES, ENDS, EVERY = "Curves", "Final values", "Every run"
 FOLDED = (
     "eval",
