@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple, TypeVar
 
 from reports import claims as rules
-from reports.analyses import beyond, comparison, readings, scaling
+from reports.analyses import alpha, beyond, comparison, readings, scaling
 from reports.claims import VERDICTS, Claim
 from reports.data.escaping import code, markdown, prose, stem, words
 from reports.data.frame import Results, TableError, load, mixed
@@ -280,6 +280,7 @@ def _study_tables(results: Results, study: str) -> dict[str, Table]:
     found = scaling.sweep(results, study)
     steadiness = tables.steadiness(results, study)
     every: dict[str, Table | None] = {
+        "effects": alpha.table_effects(results, study) if alpha.is_of(study) else None,
         "final": tables.finals(results, study),
         "pairs": comparison.pairs_table(results, study),
         "efficiency": comparison.efficiency(results, study),
