@@ -17,7 +17,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from reports.data.frame import Results
-from reports.data.stats import FEW, Interval, curve, difference
+from reports.data.stats import FEW, Interval, curve, difference, interval
 from reports.render.canvas import BLUE, GREEN, MARGIN, ORANGE, QUIET, Drawing, blank, foot, head, styled
 from reports.render.figures import spread
 from reports.render.tables import Table, describe_task, estimate, number, seeds, steps
@@ -322,3 +322,36 @@ def _finish_small(axes: Axes, title: str, words: str, *, last: bool) -> None:
     axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: steps(x)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}".replace("-", "−")))
     axes.tick_params(labelsize=7.5, labelbottom=last)
+
+
+def table_mechanism(results: Results, study: str) -> Table | None:
+    """A row per alpha and arm: what the figure shows, in the last tenth of the points; None without points."""
+    numbers, shown = [], []
+    for alpha, one in mechanism(results, study).items():
+        for name, arm in ((f"full, {one.line}", one.arm), ("no regulation", one.without)):
+            found = {quantity: _last(_points(results, study, arm, quantity)) for quantity, _ in QUANTITIES}
+            if all(value is None for value in found.values()):
+                continue
+            numbers += [
+                {"alpha": alpha, "arm": name, "quantity": quantity} | value._asdict()
+                for quantity, value in found.items()
+                if value
+            ]
+            cells = {f"{words[:1].upper()}{words[1:]}": _fine(found[quantity]) for quantity, words in QUANTITIES}
+            shown.append({"alpha": f"{alpha:g}", "Arm": name} | cells)
+            shown[-1]["Seeds"] = str(max(value.n for value in found.values() if value))
+    if not shown:
+        return None
+    note = "Mean over seeds [95 %] in the last tenth of the points of each run's curve, unfinished runs included."
+    title = f"Assigned, earned and learned from by alpha, study {study}"
+    return Table(title, pd.DataFrame(numbers), pd.DataFrame(shown), note)
+
+
+def _last(points: pd.DataFrame) -> Interval | None:
+    """The mean of each seed's last tenth of points, over seeds."""
+    means = [rows["value"].tail(-(-len(rows) // 10)).mean() for _, rows in points.groupby("seed")]
+    return interval(np.array(means, dtype=np.float64)) if means else None
+
+
+def _fine(found: Interval | None) -> str:
+    return estimate(found, lambda x: number(x, 2))

@@ -63,7 +63,7 @@ Part = TypeVar("Part")
 FIRST = ("navigation", "coverage", "scaling", "ablation")  # studies of the paper, in its order
 MORE = ("profile_", "better_", "pairs_", "steadiness_", "time_", "yardsticks")
 KINDS = (  # of tables of a study
-    *("effects", "factors", "readings"),
+    *("effects", "factors", "readings", "mechanism"),
     *("final", "pairs", "efficiency", "time", "assignments", "steadiness", "agents"),
 )
 LAST = ("provenance", "runs", "made")  # tables with a part of their own at the end
@@ -281,6 +281,7 @@ def _study_tables(results: Results, study: str) -> dict[str, Table]:
     steadiness = tables.steadiness(results, study)
     every: dict[str, Table | None] = {
         "effects": alpha.table_effects(results, study) if alpha.is_of(study) else None,
+        "mechanism": alpha.table_mechanism(results, study) if alpha.is_of(study) else None,
         "final": tables.finals(results, study),
         "pairs": comparison.pairs_table(results, study),
         "efficiency": comparison.efficiency(results, study),

@@ -150,6 +150,7 @@ def test_without_data_nothing_is_drawn(tmp_path: Path) -> None:
     assert alpha.fig_effects(results, NAME) is None
     assert alpha.fig_mechanism(results, NAME) is None
     assert alpha.table_effects(results, NAME) is None
+    assert alpha.table_mechanism(results, NAME) is None
     other = read(tmp_path / "other", study("reach", {"one": noisy(60)}))
     assert alpha.effects(other, "reach") == []
 
@@ -173,6 +174,17 @@ def test_the_mechanism_has_the_longest_horizon_and_every_alpha_that_has_points(t
     assert "full, horizon 18 (5 seeds)" in words(drawing.figure)
 
 
+def test_the_table_of_the_mechanism_has_the_end_of_the_training(tmp_path: Path) -> None:
+    table = alpha.table_mechanism(read(tmp_path, missing(planted(), "^no regulation, alpha=0.5")), NAME)
+    assert table is not None
+    rows = table.numbers.set_index(["alpha", "arm", "quantity"])
+    assert len(rows) == 3 * 3
+    assert rows.loc[(0.5, "full, horizon 18", "assigned"), "value"] == pytest.approx(10 + 2)  # the last of two points
+    assert rows.loc[(0.02, "no regulation", "earned"), "value"] == pytest.approx(-1 + 2)
+    assert table.shown["After regulation"][0].startswith("4.00 [")
+    assert table.shown["Seeds"].tolist() == ["5"] * 3
+
+
 def test_values_that_are_none_are_passed_over(tmp_path: Path) -> None:
     points, runs = planted()
     first = (points["metric"] == "train/earned") & (points["step"] == 75_000)
@@ -183,7 +195,8 @@ def test_values_that_are_none_are_passed_over(tmp_path: Path) -> None:
     assert set(drawing.numbers[drawing.numbers["quantity"] == "earned"]["step"]) == {150_000}
 
 
-def test_both_figures_and_the_table_stand_under_the_study(tmp_path: Path) -> None:
+@pytest.mark.usefixtures("unpainted")
+def test_both_figures_and_tables_stand_under_the_study(tmp_path: Path) -> None:
     results = read(tmp_path, planted())
     pictures = {one.name: one for one in gallery(results, paper())}
     for name in (f"effects_{NAME}", f"mechanism_{NAME}"):
@@ -194,7 +207,9 @@ def test_both_figures_and_the_table_stand_under_the_study(tmp_path: Path) -> Non
     assert "Regulation, horizon 1 4.0 at 0.02, 24.0 at 0.5" in pictures[f"effects_{NAME}"].alt
     built = build(tmp_path, tmp_path / "out", "quick", NAME)
     assert built.undrawn == []
-    assert {f"effects_{NAME}.png", f"mechanism_{NAME}.png", f"effects_{NAME}.md"} <= {path.name for path in built.files}
+    assert {f"{name}_{NAME}.{kind}" for name in ("effects", "mechanism") for kind in ("png", "md")} <= {
+        path.name for path in built.files
+    }
 
 
 def test_the_shipped_study_has_these_arms() -> None:
