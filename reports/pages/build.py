@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple, TypeVar
 
 from reports import claims as rules
-from reports.analyses import alpha, beyond, comparison, readings, scaling
+from reports.analyses import alpha, beyond, comparison, readings, scaling, settings
 from reports.claims import VERDICTS, Claim
 from reports.data.escaping import code, markdown, prose, stem, words
 from reports.data.frame import Results, TableError, load, mixed
@@ -61,10 +61,10 @@ DEFINITIONS = (
 
 Part = TypeVar("Part")
 FIRST = ("navigation", "coverage", "scaling", "ablation")  # studies of the paper, in its order
-MORE = ("profile_", "better_", "pairs_", "steadiness_", "time_", "yardsticks")
+MORE = ("profile_", "better_", "pairs_", "steadiness_", "time_", "settings_", "yardsticks")
 KINDS = (  # of tables of a study
     *("effects", "factors", "readings", "mechanism"),
-    *("final", "pairs", "efficiency", "time", "assignments", "steadiness", "agents"),
+    *("final", "pairs", "efficiency", "time", "assignments", "steadiness", "agents", "settings"),
 )
 LAST = ("provenance", "runs", "made")  # tables with a part of their own at the end
 COMPLETE = "Nothing: every planned run is finished."
@@ -289,6 +289,7 @@ def _study_tables(results: Results, study: str) -> dict[str, Table]:
         "assignments": beyond.table_assignments(results, study),
         "steadiness": steadiness if len(steadiness.shown) else None,
         "agents": scaling.table(results, found) if found else None,
+        "settings": settings.table(results, study),
     }
     return {f"{name}_{stem(study)}": table for name, table in every.items() if table}
 
@@ -324,7 +325,7 @@ def _index(report: Report) -> Iterator[str]:
         if name not in LAST:
             yield f"## {markdown(table.title)}\n"
             if table.note:
-                yield f"{table.note}\n"
+                yield f"{prose(table.note)}\n"
             yield f"{table.markdown()}\n"
             yield f"{_links(table.folder, name, 'CSV', 'LaTeX')}\n"
     yield "## Definitions\n"
