@@ -1,4 +1,4 @@
-"""Table 1: what the table of algorithms says of every method, with parameters counted in what it builds."""
+"""Table 1: what the table of algorithms says of every method, with its defaults and the parameters that it builds."""
 
 import json
 from pathlib import Path
@@ -26,7 +26,7 @@ class Count(NamedTuple):
 
 
 def describe() -> list[dict[str, Any]]:
-    """Every method in the order of the table: the fields of `About` and its `parameters` per task and encoder."""
+    """Every method in the order of the table: the fields of `About`, `parameters` per task and encoder, `defaults`."""
     rows = []
     for kind, method in ALGORITHMS.items():
         sizes = [
@@ -35,7 +35,8 @@ def describe() -> list[dict[str, Any]]:
             for env in TASKS
             for encoder in get_args(EncoderName)
         ]
-        rows.append({"kind": kind} | method.about._asdict() | {"parameters": sizes})
+        defaults = method.config().model_dump(mode="json")
+        rows.append({"kind": kind} | method.about._asdict() | {"parameters": sizes, "defaults": defaults})
     return rows
 
 

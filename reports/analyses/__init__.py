@@ -1,1 +1,1 @@
-"""Comparisons of arms: pairs, scaling, transfer, equivalence; no verdicts on the paper's claims."""
+"""Comparisons of arms: pairs, scaling, transfer, equivalence, effects, settings; no verdicts on the paper's claims."""

@@ -53,6 +53,7 @@ class Method(Part):
     coordination: str
     actions: tuple[str, ...]
     parameters: tuple[Size, ...]
+    defaults: dict[str, Any] = {}  # of its settings; earlier exports lack them
 
 
 class Input(Part):

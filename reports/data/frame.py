@@ -93,7 +93,7 @@ class Results:
         points: columns `POINTS`.
         runs: columns `RUNS` and `OWN`; one row per planned run. What is not known of `OWN` is no word, or NaN.
         profile: the profile that made them.
-        methods: one record per method: `METHOD` as texts, `actions`, and `parameters` per task and encoder.
+        methods: one record per method: `METHOD` as texts, `actions`, `parameters` per task and encoder, `defaults`.
         modules: the networks of Figures 1 to 3, one build per encoder.
         scenes: what Figures 4, 5 and 8 show.
         moved: trained policies with other numbers of agents and targets: columns `PLAYED`.
@@ -327,10 +327,11 @@ def load(folder: Path, profile: str, only: str | None = None) -> Results:
         gifs = {path.stem.partition("_")[2]: _animation(path) for path in sorted(folder.glob(EPISODES))}
         runs = _with_made(joined["runs"], joined[MADE])
         aside = tuple(path.name.partition(".")[0] for path in files if older(path))
-        results = Results(points, runs, profile, moved=moved, levels=joined[READINGS], notes=notes, older=aside)
+        methods, modules, scenes = drawn
+        about: dict[str, Any] = {"methods": methods, "levels": joined[READINGS], "notes": notes, "older": aside}
+        results = Results(points, runs, profile, moved=moved, **about)
         if only is None:
-            methods, modules, scenes = drawn
-            results = replace(results, methods=methods, modules=modules, scenes=scenes, episodes=gifs)
+            results = replace(results, modules=modules, scenes=scenes, episodes=gifs)
         faults = [*_made_faults(joined[MADE]), *_plan_faults(results), *_level_faults(results), *_point_faults(results)]
         if not faults:
             return results

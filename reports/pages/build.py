@@ -12,7 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple, TypeVar
 
-from reports.analyses import beyond, comparison, readings, scaling
+from reports.analyses import alpha, beyond, comparison, readings, scaling, settings
 from reports.claims import verdicts as rules
 from reports.claims.verdicts import ENOUGH, SHORT, VERDICTS, Claim
 from reports.data.escaping import code, markdown, prose, stem, words
@@ -67,10 +67,10 @@ DEFINITIONS = (
 
 Part = TypeVar("Part")
 FIRST = ("navigation", "coverage", "scaling", "ablation")  # studies of the paper, in its order
-MORE = ("profile_", "better_", "pairs_", "steadiness_", "time_", "yardsticks")
+MORE = ("profile_", "better_", "pairs_", "steadiness_", "time_", "settings_", "yardsticks")
 KINDS = (  # of tables of a study
-    *("effects", "factors", "readings"),
-    *("final", "pairs", "efficiency", "time", "assignments", "steadiness", "agents"),
+    *("effects", "factors", "readings", "mechanism"),
+    *("final", "pairs", "efficiency", "time", "assignments", "steadiness", "agents", "settings"),
 )
 LAST = ("provenance", "runs", "made")  # tables with a part of their own at the end
 COMPLETE = "Nothing: every planned run is finished."
@@ -307,6 +307,8 @@ def _study_tables(results: Results, study: str) -> dict[str, Table]:
     found = scaling.sweep(results, study)
     steadiness = tables.steadiness(results, study)
     every: dict[str, Table | None] = {
+        "effects": alpha.table_effects(results, study) if alpha.is_of(study) else None,
+        "mechanism": alpha.table_mechanism(results, study) if alpha.is_of(study) else None,
         "final": tables.finals(results, study),
         "pairs": comparison.pairs_table(results, study),
         "efficiency": comparison.efficiency(results, study),
@@ -314,6 +316,7 @@ def _study_tables(results: Results, study: str) -> dict[str, Table]:
         "assignments": beyond.table_assignments(results, study),
         "steadiness": steadiness if len(steadiness.shown) else None,
         "agents": scaling.table(results, found) if found else None,
+        "settings": settings.table(results, study),
     }
     return {f"{name}_{stem(study)}": table for name, table in every.items() if table}
 
@@ -349,7 +352,7 @@ def _index(report: Report) -> Iterator[str]:
         if name not in LAST:
             yield f"## {markdown(table.title)}\n"
             if table.note:
-                yield f"{table.note}\n"
+                yield f"{prose(table.note)}\n"
             yield f"{table.markdown()}\n"
             yield f"{_links(table.folder, name, 'CSV', 'LaTeX')}\n"
     yield "## Definitions\n"

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import NamedTuple
 
-from reports.analyses import beyond, comparison, readings, scaling
+from reports.analyses import alpha, beyond, comparison, readings, scaling
 from reports.analyses.scaling import Sweep
 from reports.data.drawn import Counterexample, Scenes
 from reports.data.escaping import stem
@@ -104,10 +104,12 @@ def study_gallery(results: Results, paper: Paper, study: str) -> list[Picture]:
 
 
 def comparisons(results: Results) -> Iterator[Picture]:
-    """Figures that the paper lacks: assignments, performance profiles, probabilities of improvement, transfer."""
+    """Figures that the paper lacks: effects by alpha, assignments, profiles, probabilities of improvement, transfer."""
     for study in results.studies:
         if results.has_readings(study):
             continue
+        if alpha.is_of(study):
+            yield from _by_alpha(results, study)
         made = f"rhmc assignments studies/{study.partition('@')[0]}.yaml --profile {results.profile}"
         title = f"What is assigned while training, study {study}"
         name = stem(study)
@@ -136,6 +138,35 @@ def _specification(results: Results, study: str, found: readings.Contrast) -> Ma
         f"{len(found.effects)}). See which levels crowd at one end: these decide."
     )
     alt = f"Effects of {len(found.effects)} readings with intervals, and the level of each factor under each."
+    return (caption, alt, drawing) if drawing else None
+
+
+def _by_alpha(results: Results, study: str) -> Iterator[Picture]:
+    """What regulation and the filter are worth at each alpha, and the rewards behind that."""
+    title = f"Effect of regulation and of the filter by alpha, study {study}"
+    yield from picture(f"effects_{stem(study)}", title, partial(_effects, results, study), study)
+    title = f"The mechanism, seen, study {study}"
+    yield from picture(f"mechanism_{stem(study)}", title, partial(_mechanism, results, study), study)
+
+
+def _effects(results: Results, study: str) -> Made | None:
+    drawing = alpha.fig_effects(results, study)
+    caption = (
+        "Above zero the part helps. See whether the lines on the left rise: then regulation is worth more, the more "
+        "Eq. 6 charges; whether a longer horizon adds to that; and whether on the right any interval leaves zero."
+    )
+    return (caption, alpha.described(results, study), drawing) if drawing else None
+
+
+def _mechanism(results: Results, study: str) -> Made | None:
+    drawing = alpha.fig_mechanism(results, study)
+    caption = (
+        "Down a column: what is assigned, what that earned, and what the coordinator learned from. See how far the "
+        "regulated reward lies above the earned one while executors still learn, and whether without it, as alpha "
+        "grows, ever fewer pairs are assigned."
+    )
+    columns = joined(f"{x:g}" for x in alpha.mechanism(results, study))
+    alt = f"Line charts of assigned pairs, earned and regulated reward against environment steps, for alpha {columns}."
     return (caption, alt, drawing) if drawing else None
 
 

@@ -56,6 +56,8 @@ def test_every_method_is_described_and_counted() -> None:
         assert [(s["task"]["kind"], s["encoder"]) for s in record["parameters"]] == list(
             product(("coverage", "navigation"), ("mlp", "pairwise"))
         )
+        assert ALGORITHMS[record["kind"]].config(**record["defaults"]) == ALGORITHMS[record["kind"]].config()
+        assert record["defaults"]["kind"] == record["kind"]
         assert all(0 < s["acting"] <= s["all"] for s in record["parameters"])
     centred = {r["kind"] for r in records if r["parameters"][0]["acting"] < r["parameters"][0]["all"]}
     assert centred == set(ALGORITHMS) - {"iql", "vdn"}
