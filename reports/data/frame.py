@@ -269,6 +269,11 @@ class Results:
         return max((int(x) for x in found if x is not None), default=None)
 
     @cached_property
+    def memo(self) -> dict[str, Any]:
+        """What several parts of a report work out of these tables once, by name."""
+        return {}
+
+    @cached_property
     def _plans(self) -> dict[tuple[str, str | None], pd.DataFrame]:
         return {}
 
