@@ -8,6 +8,7 @@ linear model without interactions. A reading under which an arm learned nothing 
 """
 
 import warnings
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -166,35 +167,35 @@ def fitted(found: Contrast) -> Fit:
 
     NaN: intervals and F tests where no reading is left over, and what unfinished readings leave undetermined.
     """
-    constant, factors = -1, dict(enumerate(found.levels.columns))  # names of blocks: a factor may have any name
-    blocks = {constant: pd.DataFrame({"": 1.0}, found.levels.index)}
-    blocks |= {at: _coded(found.levels[name]) for at, name in factors.items()}
-    design = pd.concat(blocks, axis=1)
+    codes = [_coded(found.levels[name]) for name in found.levels]
+    design = np.column_stack([np.ones(len(found.levels)), *codes])
+    owner = np.repeat(np.arange(-1, len(codes)), [1, *(block.shape[1] for block in codes)])  # of each column; -1: mean
     fit = _least_squares(found.effects, design)
-    rows, tests = [], []
-    for at, name in factors.items():
-        first = ~found.levels[name].duplicated()
-        weights = design[first].to_numpy() * design.columns.get_level_values(0).isin([constant, at])
-        own, counts = found.levels[name][first].to_numpy(), found.levels[name].value_counts()
-        table = pd.DataFrame(_determined(fit, weights), columns=["effect", "low", "high"])
-        rows.append(table.assign(factor=str(name), level=own, readings=counts[own].to_numpy()))
-        ratio, p = _f_test(fit, _least_squares(found.effects, design.drop(columns=at, level=0)))
-        tests.append({"factor": str(name), "f": ratio, "p": p})
-    levels = pd.concat(rows, ignore_index=True)[["factor", "level", "readings", "effect", "low", "high"]]
-    tested = pd.DataFrame(tests)
-    return Fit(levels, tested.assign(p_corrected=holm(tested["p"].to_numpy(np.float64))))
+    rows: list[tuple[object, ...]] = []
+    tests = []
+    for at, name in enumerate(map(str, found.levels)):
+        own = found.levels.iloc[:, at].tolist()
+        counts = Counter(own)
+        weights = design[[own.index(level) for level in counts]] * np.isin(owner, [-1, at])
+        values = _determined(fit, weights).tolist()
+        rows += [(name, level, n, *x) for (level, n), x in zip(counts.items(), values, strict=True)]
+        tests.append((name, *_f_test(fit, _least_squares(found.effects, design[:, owner != at]))))
+    levels = pd.DataFrame(rows, columns=["factor", "level", "readings", "effect", "low", "high"])
+    factors = pd.DataFrame(tests, columns=["factor", "f", "p"])
+    return Fit(levels, factors.assign(p_corrected=holm(factors["p"].to_numpy(np.float64))))
 
 
-def _coded(levels: pd.Series) -> pd.DataFrame:
+def _coded(levels: pd.Series) -> Values:
     """Levels as deviations from their mean: a row per reading, a column less than levels."""
-    own = pd.get_dummies(levels, dtype=float)
-    return own.iloc[:, :-1].sub(own.iloc[:, -1], axis=0)
+    names, at = np.unique(levels.tolist(), return_inverse=True)
+    own = np.eye(len(names))[at]
+    return own[:, :-1] - own[:, -1:]
 
 
-def _least_squares(values: Values, design: pd.DataFrame) -> RegressionResults:
+def _least_squares(values: Values, design: Values) -> RegressionResults:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SingularMatrixWarning)  # `_determined` leaves out what is not unique
-        return OLS(values, design.to_numpy()).fit()
+        return OLS(values, design).fit()
 
 
 def _determined(fit: RegressionResults, weights: Values) -> Values:
