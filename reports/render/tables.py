@@ -8,7 +8,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from reports.data.escaping import latex, line, markdown
-from reports.data.frame import FINAL, METHOD, OWN, PLACE, TOLD, Results, adopted
+from reports.data.frame import EPISODE_ERROR, FINAL, METHOD, OWN, PLACE, TOLD, Results, adopted
 from reports.data.paper import Paper
 from reports.data.stats import FEW, LEVEL, Interval, Range, change, improvement, interval, iqm
 
@@ -121,7 +121,11 @@ def finals(results: Results, study: str) -> Table:
         values = results.finals(study, arm)
         ours = _estimates(values)
         low, high = (values.min(), values.max()) if len(values) else (np.nan, np.nan)
-        numbers.append({"study": study, "arm": arm} | ours | {"worst_seed": low, "best_seed": high})
+        errors = results.finals(study, arm, EPISODE_ERROR)
+        luck = float(np.sqrt(np.mean(errors**2))) if len(errors) else np.nan
+        numbers.append(
+            {"study": study, "arm": arm} | ours | {"worst_seed": low, "best_seed": high, "episode_error": luck}
+        )
         shown.append(
             {
                 "Arm": arm,
@@ -131,7 +135,26 @@ def finals(results: Results, study: str) -> Table:
                 "Seeds": seeds(results, study, arm),
             }
         )
-    return Table(f"Final results of study {study}", pd.DataFrame(numbers), pd.DataFrame(shown))
+    return Table(f"Final results of study {study}", pd.DataFrame(numbers), pd.DataFrame(shown), _luck(results, study))
+
+
+def _luck(results: Results, study: str) -> str:
+    """What the evaluation episodes add to a final return, in words; none where no run says it."""
+    errors = np.concatenate(
+        [results.finals(study, arm, EPISODE_ERROR) for arm in results.arms(study)] or [np.array([])]
+    )
+    errors = errors[errors > 0]  # a single episode has none
+    if not len(errors):
+        return ""
+    span, episodes = (
+        " to ".join(dict.fromkeys(number(x, 2) for x in np.sort(errors)[[0, -1]])),
+        results.final_episodes(study),
+    )
+    return (
+        f"Luck of the evaluation episodes: the standard error of one run's final return is {span} points"
+        f"{f' ({episodes:,} episodes)' if episodes else ''}. All runs play the same episodes: what their luck has in "
+        "common is not in the intervals and ranges, and cancels in the difference of two arms."
+    )
 
 
 def steadiness(results: Results, study: str) -> Table:
