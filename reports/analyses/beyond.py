@@ -11,10 +11,10 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from reports.data.frame import ASSIGN, FINAL, Results
-from reports.data.stats import FEW, Interval, curve, difference, interval
+from reports.data.stats import Interval, curve, difference, interval
 from reports.render.canvas import FAINT, QUIET, Drawing, blank, foot, head, look, styled
 from reports.render.figures import spread
-from reports.render.tables import NONE, Table, describe_task, estimate, number, readable, seeds, steps
+from reports.render.tables import NONE, SPAN, Table, describe_task, estimate, number, readable, seeds, spans, steps
 
 PANELS = (
     ("pairs", "assigned pairs"),
@@ -71,7 +71,7 @@ def fig_assignments(results: Results, study: str) -> Drawing | None:
         how: dict[str, Any] = {"ncols": min(4, len(arms)), "frameon": False, "fontsize": 8.5}
         figure.legend(list(handles.values()), names, loc="lower left", bbox_to_anchor=(0.03, 0.07), **how)
         words = "mean per state of the training itself, exploration included, against environment steps"
-        foot(figure, f"{words}; band: 95 % bootstrap interval, none with one seed")
+        foot(figure, f"{words}; band: {spans(n for rows in parts for n in rows['n'])}")
     columns = ["arm", "quantity", "step", "mean", "low", "high", "n"]
     return Drawing(figure, pd.concat(parts, ignore_index=True)[columns])
 
@@ -179,11 +179,8 @@ def fig_transfer(results: Results) -> Drawing | None:
                 for name, by in yardsticks.items()
                 for count, value in by.items()
             ]
-        least = min(x.n for arms in found.values() for by in arms.values() for x in by.values())
-        few = f" (fewer than {FEW} seeds: narrower than 95 %)" if least < FEW else ""
-        words = (
-            f"points: mean over seeds; bars: 95 % bootstrap interval{few}; grey bar: as trained; grey lines: without"
-        )
+        bars = spans(x.n for arms in found.values() for by in arms.values() for x in by.values())
+        words = f"points: mean over seeds; bars: {bars}; grey bar: as trained; grey lines: without"
         foot(figure, f"{words} learning, and a bound")
     columns = ["along", "kind", "name", "count", "value", "low", "high", "seeds"]
     return Drawing(figure, pd.DataFrame(rows, columns=columns))
@@ -214,7 +211,7 @@ def table_transfer(results: Results) -> Table | None:
         shown.append(cells)
     note = (
         f"Sensors x targets; policies trained with {_trained(results, 'agents')} x {_trained(results, 'targets')}, no "
-        "step of training with the others. Below the methods: without learning, and a bound."
+        f"step of training with the others; mean {SPAN} over seeds. Below the methods: without learning, and a bound."
     )
     return Table("Transfer to other numbers of sensors and targets", pd.DataFrame(numbers), pd.DataFrame(shown), note)
 
@@ -329,7 +326,7 @@ def table_encoder(results: Results) -> Table | None:
                     "Fully connected": flat,
                 }
                 | {"Pairwise, final": number(_mean(x)), "Fully connected, final": number(_mean(y))}
-                | {"Difference [95 %]": estimate(gap)}
+                | {f"Difference {SPAN}": estimate(gap)}
                 | {"Seeds": f"{seeds(results, study, pairwise)}; {seeds(results, study, flat)}"}
             )
     if not numbers:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from reports.data.frame import FINAL, Results
 from reports.data.stats import Interval, area, difference, first_at, holm, improvement, interval, welch
 from reports.render.canvas import Drawing, blank, foot, head, look, styled
-from reports.render.tables import MEASURED, NONE, Table, estimate, number, steps
+from reports.render.tables import MEASURED, NONE, SPAN, Table, estimate, number, steps
 
 LETTERS, LONGEST = 44, 60  # of a name on a line of a legend, and beside a matrix
 MOST = 12  # arms of a matrix that can still be read
@@ -76,7 +76,7 @@ def pairs_table(results: Results, study: str) -> Table | None:
         {
             "Higher mean": x.first,
             "Other": x.second,
-            "Difference [95 %]": estimate(x.difference, lambda v: number(v, 2)),
+            f"Difference {SPAN}": estimate(x.difference, lambda v: number(v, 2)),
             "P(first better) [95 %]": estimate(x.better, lambda v: f"{v:.2f}"),
             "p": _chance(x.p),
             "p, Holm": _chance(x.corrected),
@@ -106,7 +106,7 @@ def efficiency(results: Results, study: str) -> Table | None:
         shown.append(
             {
                 "Arm": arm,
-                "Mean height of the curve [95 %]": estimate(height),
+                f"Mean height of the curve {SPAN}": estimate(height),
                 "Seeds that reach the level": f"{int(reached.sum())} of {len(runs)}",
                 "Steps to it, median": steps(steps_to) if all_reached else NONE,
             }
@@ -239,9 +239,9 @@ def _chance(p: float) -> str:
 def _pairs_note(found: Sequence[Pair]) -> str:
     least = min(x.difference.n for x in found)
     note = (
-        "p: Welch's test over seeds; Holm: corrected for all pairs of this table. Intervals are of one pair each, not "
-        "corrected. All arms play the same final episodes; single episodes are not exported, so the pairing is "
-        "of arms, not of episodes."
+        "p: Welch's test over seeds; Holm: corrected for all pairs of this table. Intervals and ranges are of one pair "
+        "each, not corrected. All arms play the same final episodes; single episodes are not exported, so the pairing "
+        "is of arms, not of episodes."
     )
     if least < 4:
         note += f" With {least} seeds a side no test by ranks can come below p = {_rank_limit(least):.2g}."

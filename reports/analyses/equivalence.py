@@ -16,6 +16,7 @@ from reports.data.drawn import files_in
 from reports.data.exported import older
 from reports.data.frame import FINAL, TableError
 from reports.data.stats import Interval, Values, difference, equivalence, equivalence_of_pairs
+from reports.render.tables import SPAN, estimate
 
 MARGIN = 1.0  # points of return
 LEVEL = 0.05
@@ -162,7 +163,7 @@ def table(compared: Sequence[Compared]) -> list[list[str]]:
     ]
 
 
-COLUMNS = ["study", "arm", "seeds", "difference [95 %]", "p", "outcome", "note"]
+COLUMNS = ["study", "arm", "seeds", f"difference {SPAN}", "p", "outcome", "note"]
 
 
 def summary(compared: Sequence[Compared], name: str) -> str:
@@ -181,8 +182,7 @@ def _arms(count: int) -> str:
 def _shown(interval: Interval) -> str:
     if np.isnan(interval.value):
         return ""
-    ends = "" if np.isnan(interval.low) else f" [{interval.low:.2f}, {interval.high:.2f}]"
-    return f"{interval.value:+.2f}{ends}"
+    return estimate(interval, lambda x: f"{x:+.2f}")
 
 
 def _number(p: float) -> str:

@@ -7,14 +7,20 @@ share one variance, pooled over arms and readings, as two seeds have none of the
 linear model without interactions. A reading under which an arm learned nothing counts like any other, and is marked.
 """
 
+import warnings
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
-from scipy.stats import f, permutation_test, t
+from scipy.stats import permutation_test, t
+from statsmodels.regression.linear_model import OLS, RegressionResults
+from statsmodels.tools.sm_exceptions import SingularMatrixWarning
 
 from reports.data.frame import FINAL, ORDER, Results
 from reports.data.stats import LEVEL, SEED, Interval, holm
@@ -33,7 +39,8 @@ BETTER, WORSE = BLUE, ORANGE  # of effects whose interval is above, below zero
 Values = NDArray[np.float64]
 
 
-class Contrast(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Contrast:
     """The whole method against an arm without a part, under R readings with S seeds each.
 
     Attributes:
@@ -50,10 +57,15 @@ class Contrast(NamedTuple):
     other: Values
     missing: int
 
-    @property
+    @cached_property
     def effects(self) -> Values:
         """(R,)."""
         return np.asarray((self.full - self.other).mean(1))
+
+    @cached_property
+    def fit(self) -> "Fit":
+        """What `fitted` finds."""
+        return fitted(self)
 
 
 class Fit(NamedTuple):
@@ -88,12 +100,19 @@ def sides(found: Contrast) -> tuple[float, float]:
 
 def deciding(found: Contrast) -> list[str]:
     """The factors that change the effect, after Holm's correction over all factors; the smallest p first."""
-    table = fitted(found).factors.sort_values("p_corrected", kind="stable")
+    table = found.fit.factors.sort_values("p_corrected", kind="stable")
     return [str(name) for name in table[table["p_corrected"] < 1 - LEVEL]["factor"]]
 
 
 def contrasts(results: Results, study: str) -> list[Contrast]:
     """The first arm of a study with readings against each other one; none without readings."""
+    kept: dict[str, list[Contrast]] = results.memo.setdefault("contrasts", {})
+    if study not in kept:
+        kept[study] = _contrasts(results, study)
+    return kept[study]
+
+
+def _contrasts(results: Results, study: str) -> list[Contrast]:
     table = results.levels[results.levels["study"] == study]
     arms = sorted(set(table["contrast"]), key=lambda arm: (ORDER.index(arm) if arm in ORDER else len(ORDER), arm))
     return [_contrast(results, table, arms[0], arm) for arm in arms[1:]]
@@ -149,42 +168,57 @@ def permuted(found: Contrast) -> float:
 
 
 def fitted(found: Contrast) -> Fit:
-    """Main effects of the factors on the effect."""
-    blocks = {str(name): _coded(found.levels[name]) for name in found.levels.columns}
-    design = np.column_stack([np.ones(len(found.levels)), *(block.to_numpy() for block in blocks.values())])
-    left = _rss(design, found.effects)
-    free = len(design) - int(np.linalg.matrix_rank(design))
-    inverse = np.linalg.pinv(design)
-    spread = left / free * (inverse @ inverse.T) if free else np.full((design.shape[1],) * 2, np.nan)
-    terms = inverse @ found.effects
-    rows, tests, at = [], [], 1
-    for name, block in blocks.items():
-        columns = np.arange(at, at + block.shape[1])
-        rest = np.delete(design, columns, axis=1)
-        gain = (_rss(rest, found.effects) - left) / len(columns)
-        ratio = gain / (left / free) if free and left > 0 else np.nan
-        tests.append({"factor": name, "f": ratio, "p": float(f.sf(ratio, len(columns), free))})
-        for level, codes in block.drop_duplicates().iterrows():
-            weights = np.zeros(len(terms))
-            weights[0], weights[columns] = 1, codes
-            value, reach = weights @ terms, t.ppf((1 + LEVEL) / 2, free) * np.sqrt(weights @ spread @ weights)
-            count = int((found.levels[name] == level).sum())
-            rows.append({"factor": name, "level": level, "readings": count, "effect": value})
-            rows[-1] |= {"low": value - reach, "high": value + reach}
-        at += len(columns)
-    factors = pd.DataFrame(tests)
-    return Fit(pd.DataFrame(rows), factors.assign(p_corrected=holm(factors["p"].to_numpy(np.float64))))
+    """Main effects of the factors on the effect, each level's averaged over the levels of the other factors.
+
+    NaN: intervals and F tests where no reading is left over, and what unfinished readings leave undetermined.
+    """
+    codes = [_coded(found.levels[name]) for name in found.levels]
+    design = np.column_stack([np.ones(len(found.levels)), *codes])
+    owner = np.repeat(np.arange(-1, len(codes)), [1, *(block.shape[1] for block in codes)])  # of each column; -1: mean
+    fit = _least_squares(found.effects, design)
+    rows: list[tuple[object, ...]] = []
+    tests = []
+    for at, name in enumerate(map(str, found.levels)):
+        own = found.levels.iloc[:, at].tolist()
+        counts = Counter(own)
+        weights = design[[own.index(level) for level in counts]] * np.isin(owner, [-1, at])
+        values = _determined(fit, weights).tolist()
+        rows += [(name, level, n, *x) for (level, n), x in zip(counts.items(), values, strict=True)]
+        tests.append((name, *_f_test(fit, _least_squares(found.effects, design[:, owner != at]))))
+    levels = pd.DataFrame(rows, columns=["factor", "level", "readings", "effect", "low", "high"])
+    factors = pd.DataFrame(tests, columns=["factor", "f", "p"])
+    return Fit(levels, factors.assign(p_corrected=holm(factors["p"].to_numpy(np.float64))))
 
 
-def _coded(levels: pd.Series) -> pd.DataFrame:
-    """Levels as deviations from their mean: a row per reading, named by its level, a column less than levels."""
-    names = sorted(set(levels))
-    codes = np.vstack([np.eye(len(names) - 1), -np.ones(len(names) - 1)])
-    return pd.DataFrame(codes[[names.index(level) for level in levels]], index=list(levels))
+def _coded(levels: pd.Series) -> Values:
+    """Levels as deviations from their mean: a row per reading, a column less than levels."""
+    names, at = np.unique(levels.tolist(), return_inverse=True)
+    own = np.eye(len(names))[at]
+    return own[:, :-1] - own[:, -1:]
 
 
-def _rss(design: Values, values: Values) -> float:
-    return float(((values - design @ (np.linalg.pinv(design) @ values)) ** 2).sum())
+def _least_squares(values: Values, design: Values) -> RegressionResults:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SingularMatrixWarning)  # `_determined` leaves out what is not unique
+        return OLS(values, design).fit()
+
+
+def _determined(fit: RegressionResults, weights: Values) -> Values:
+    """Weighted sums of a model's terms with their intervals, NaN where the readings do not determine them. (k, 3)."""
+    with np.errstate(divide="ignore", invalid="ignore"):  # no degrees of freedom: the variance is NaN
+        test = fit.t_test(weights)
+        found = np.column_stack([test.effect, test.conf_int(1 - LEVEL)])
+    found[:, 1:] = np.where(fit.df_resid > 0, found[:, 1:], np.nan)
+    known = np.isclose(weights @ fit.model.pinv_wexog @ fit.model.exog, weights).all(1)
+    return np.where(known[:, None], found, np.nan)
+
+
+def _f_test(fit: RegressionResults, rest: RegressionResults) -> tuple[float, float]:
+    """F and p of the terms that a model has more than another; NaN if they add nothing, or nothing is left over."""
+    if fit.df_resid == 0 or rest.df_resid == fit.df_resid or fit.ssr == 0:
+        return np.nan, np.nan
+    ratio, p, _ = fit.compare_f_test(rest)
+    return float(ratio), float(p)
 
 
 def unlearned(results: Results, study: str, values: Values) -> NDArray[np.bool_]:
@@ -384,15 +418,14 @@ def main_effects(results: Results, study: str) -> Table:
     """A row per contrast, factor and level: the effect there, averaged over the other factors."""
     tables, shown = [], []
     for found in _begun(results, study):
-        fit = fitted(found)
-        both = fit.levels.merge(fit.factors, on="factor").assign(without=found.without)
+        both = found.fit.levels.merge(found.fit.factors, on="factor").assign(without=found.without)
         tables.append(both)
         for row in both.to_dict("records"):
             value = Interval(row["effect"], row["low"], row["high"], row["readings"])
             shown.append(
                 {"Without": found.without, "Factor": row["factor"], "Level": row["level"]}
                 | {"Readings": str(row["readings"]), "Effect [95 %]": estimate(value)}
-                | {"p (Holm)": f"{row['p_corrected']:.4f}"}
+                | {"p (Holm)": number(row["p_corrected"], 4)}
             )
     note = "A linear model without interactions. p: F test of the factor, corrected for the number of factors."
     numbers = pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()

@@ -10,10 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from reports.data.frame import FINAL, ORDER, Results
-from reports.data.stats import FEW, Interval, interval
+from reports.data.stats import Interval, interval
 from reports.render.canvas import FAINT, QUIET, Drawing, blank, foot, head, look, styled
 from reports.render.figures import spread
-from reports.render.tables import NONE, Table, estimate, number, readable, seeds, steps
+from reports.render.tables import NONE, SPAN, Table, estimate, number, readable, seeds, spans, steps
 
 STUDY = "scaling"
 LETTERS = 34  # of a name on a line beside the axes
@@ -67,11 +67,8 @@ def figure(results: Results, found: Sweep) -> Drawing | None:
         axes.set_ylabel("final return")
         axes.yaxis.set_major_locator(MaxNLocator(8))
         _name(axes, labels)
-        few = min(x.n for by_count in values.values() for x in by_count.values())
-        words = f" (fewer than {FEW} seeds somewhere: narrower than 95 %)" if few < FEW else ""
-        foot(
-            picture, f"points: mean over seeds; bars: 95 % bootstrap interval{words}\n{_missing_words(results, found)}"
-        )
+        bars = spans(x.n for by_count in values.values() for x in by_count.values())
+        foot(picture, f"points: mean over seeds; bars: {bars}\n{_missing_words(results, found)}")
     return Drawing(picture, _numbers(values, yardsticks))
 
 
@@ -82,7 +79,7 @@ def table(results: Results, found: Sweep) -> Table:
     for method, arms in found.arms.items():
         cells = {f"{n} agents": _cell(results, found, values[method].get(n), arms.get(n)) for n in found.counts}
         shown.append({"Method": method} | cells)
-    note = "Mean over seeds and 95 % interval; in brackets the seeds, where not all planned ones are finished."
+    note = f"Mean {SPAN} over seeds, and the number of seeds where not all planned ones are finished."
     return Table(
         f"Final return by number of agents, study {found.study}", _numbers(values, {}), pd.DataFrame(shown), note
     )
@@ -92,7 +89,7 @@ def _cell(results: Results, found: Sweep, value: Interval | None, arm: str | Non
     if arm is None:
         return NONE
     done = seeds(results, found.study, arm)
-    return estimate(value) + (f" ({done})" if " of " in done else "")
+    return estimate(value) + (f"; {done} seeds" if " of " in done else "")
 
 
 def _place(method: str) -> tuple[int, str]:

@@ -58,7 +58,8 @@ EPISODES = "episode_*.gif"  # animations, one a task
 YARDSTICKS, THEOREM = "yardsticks", "theorem"  # tables that are no studies
 ASSIGN = "assign/"  # prefix of its metrics
 FINAL, CURVE = "final/return", "eval/return"
-ERRORS = ("final/return_sem", "final/coverage_sem")  # of a yardstick; one of both is there
+EPISODE_ERROR = "final/return_sem"  # standard error of a final return over its evaluation episodes
+ERRORS = (EPISODE_ERROR, "final/coverage_sem")  # of a yardstick; one of both is there
 CHECKED = ("final/", "eval/", "theorem/", ASSIGN)  # metrics that are shown: they must be finite
 REMEDY = "`rhmc export` and `rhmc yardsticks all` write them anew, and how runs were made to *.made.parquet"
 OLDER = "made by an older version and set aside, until `rhmc study run` and `rhmc export` make them anew"
@@ -267,6 +268,11 @@ class Results:
     def _trainer(self, study: str, name: str) -> int | None:
         found = [_config(text).get("trainer", {}).get(name) for text in self.plan(study)["config"]]
         return max((int(x) for x in found if x is not None), default=None)
+
+    @cached_property
+    def memo(self) -> dict[str, Any]:
+        """What several parts of a report work out of these tables once, by name."""
+        return {}
 
     @cached_property
     def _plans(self) -> dict[tuple[str, str | None], pd.DataFrame]:

@@ -10,9 +10,9 @@ normal data (3000 samples each), a "95 %" interval of the mean held the truth in
 
 `expanded` is the percentile interval at a wider nominal level, so chosen that it is as wide as Student's t interval
 would be (Hesterberg 2015, "What teachers should know about the bootstrap", 10.1080/00031305.2015.1089789). It is what
-this module uses. No resampling can reach beyond the smallest and largest value, so of three seeds the interval is
-their range: `Interval.few` marks what rests on fewer than `FEW`. Comparisons of two samples take the level of the
-smaller one; the same measurement gives .90 for 3 and 3 seeds, .96 for 5 and 5, .97 for 10 and 10.
+this module uses from `FEW` seeds on. No resampling can reach beyond the smallest and largest value: of fewer seeds
+there is their `Range`, which is shown as one and not as a 95 % interval. Comparisons of two samples take the level of
+the smaller one; the same measurement gives .90 for 3 and 3 seeds, .96 for 5 and 5, .97 for 10 and 10.
 """
 
 from collections.abc import Callable
@@ -28,7 +28,7 @@ from scipy.stats import mannwhitneyu, norm, t, trim_mean, ttest_1samp, ttest_ind
 SEED = 20_240
 RESAMPLES = 40_000  # the cut tails of few seeds are thin
 LEVEL = 0.95
-FEW = 5  # below it the measured coverage is under 90 %
+FEW = 5  # with fewer seeds a bootstrap ends at the smallest and largest value
 
 Values = NDArray[np.float64]
 Statistic = Callable[[Values], Values]  # (..., n) -> (...)
@@ -43,11 +43,6 @@ class Interval(NamedTuple):
     high: float
     n: int  # seeds; of the smaller sample in a comparison
 
-    @property
-    def few(self) -> bool:
-        """True if the interval rests on too few seeds to be trusted at its nominal level."""
-        return self.n < FEW
-
     def above(self, x: float) -> bool:
         """True if the whole interval lies above x. False when there is no interval."""
         return bool(self.low > x)
@@ -59,6 +54,16 @@ class Interval(NamedTuple):
     def holds(self, x: float) -> bool:
         """True if x lies in the interval. False when there is no interval."""
         return bool(self.low <= x <= self.high)
+
+
+class Range(Interval):
+    """An estimate of fewer than `FEW` seeds with the least and the greatest value that their resamples have.
+
+    Of a mean these are the worst and the best seed; of a difference, every seed of one sample against every one of the
+    other lies between them. No 95 % interval: the module's docstring has what three seeds' range holds.
+    """
+
+    __slots__ = ()
 
 
 def mean(x: Values) -> Values:
@@ -78,7 +83,7 @@ def tail(n: int) -> float:
 
 
 def interval(x: Values, statistic: Statistic = mean) -> Interval:
-    """A statistic of one arm's seeds. x: (n,), n >= 1."""
+    """A statistic of one arm's seeds; a `Range` below `FEW`. x: (n,), n >= 1."""
     x = np.asarray(x, dtype=np.float64)
     return _interval(float(statistic(x)), lambda: statistic(_resample(x)), len(x))
 
@@ -183,14 +188,14 @@ def first_at(steps: Values, values: Values, level: float) -> float:
 
 
 def contrast(function: Contrast, x: Values, y: Values) -> Interval:
-    """A function of two independent samples, each resampled by itself."""
+    """A function of two independent samples, each resampled by itself; a `Range` where one has fewer than `FEW`."""
     x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     n = min(len(x), len(y))
     return _interval(float(function(x, y)), lambda: function(_resample(x), _resample(y, 1)), n)
 
 
 def curve(points: pd.DataFrame) -> pd.DataFrame:
-    """Mean and interval over seeds at every step.
+    """Mean and interval over seeds at every step, below `FEW` seeds their range.
 
     Args:
         points: columns seed, step, value; one row per seed and step.
@@ -212,7 +217,7 @@ def _means(table: pd.DataFrame, n: int) -> pd.DataFrame:
     x = np.array([table[step].dropna().to_numpy(np.float64) for step in table.columns]).T  # (n, k)
     found = pd.DataFrame({"step": table.columns, "mean": x.mean(0), "low": np.nan, "high": np.nan, "n": n})
     if n > 1:
-        found["low"], found["high"] = np.quantile(x.T @ _shares(n), [tail(n), 1 - tail(n)], axis=1)
+        found["low"], found["high"] = np.quantile(x.T @ _shares(n), _cuts(n), axis=1)
     return found
 
 
@@ -249,6 +254,10 @@ def _shares(n: int) -> Values:
 def _interval(value: float, draw: Callable[[], Values], n: int) -> Interval:
     if n < 2:
         return Interval(value, np.nan, np.nan, n)
-    cut = tail(n)
-    low, high = np.quantile(draw(), [cut, 1 - cut])
-    return Interval(value, float(low), float(high), n)
+    low, high = np.quantile(draw(), _cuts(n))
+    return (Range if n < FEW else Interval)(value, float(low), float(high), n)
+
+
+def _cuts(n: int) -> list[float]:
+    """The quantiles of the resamples at which an interval ends, or a range."""
+    return [0.0, 1.0] if n < FEW else [tail(n), 1 - tail(n)]

@@ -18,13 +18,13 @@ from reports.claims.verdicts import ENOUGH, SHORT, VERDICTS, Claim
 from reports.data.escaping import code, markdown, prose, stem, words
 from reports.data.frame import Results, TableError, load, mixed
 from reports.data.paper import Paper, PaperError, read
-from reports.data.stats import FEW
+from reports.data.stats import FEW, Range
 from reports.pages import page
 from reports.pages.gallery import Picture, gallery, in_short, reason, study_gallery
 from reports.render import tables
 from reports.render.canvas import save, write_csv
 from reports.render.glyphs import LOST
-from reports.render.tables import MEASURED, TABLES, Table, joined, steps
+from reports.render.tables import MEASURED, SPAN, TABLES, Table, joined, steps
 
 PART = ".report-"  # begins the name of the folder in which a report is made
 DONE, UNDRAWN, BAD = 0, 1, 2  # exit codes
@@ -44,8 +44,13 @@ DEFINITIONS = (
     (
         "[95 %]",
         "bootstrap over seeds (40 000 resamples, one fixed generator), the percentile interval widened to the width of "
-        f"Student's t. With fewer than {FEW} seeds it is narrower than its name (three seeds: their range, which holds "
-        "the true mean in about 3 of 4 cases).",
+        "Student's t; of P Newcombe's, over readings from the pooled variance.",
+    ),
+    (
+        "(range)",
+        f"with fewer than {FEW} seeds a bootstrap ends at the worst and the best seed. Round brackets have this range "
+        "of the resamples, which is no 95 % interval; rules take it for one. Three seeds' range holds the true mean in "
+        "about 3 of 4 cases.",
     ),
     ("IQM", "mean without the lowest and the highest quarter of seeds; with fewer than four seeds that is the mean."),
     ("Change", "of the mean against full RHMC, in percent."),
@@ -390,6 +395,7 @@ def _content(report: Report, pictures: Path) -> Mapping[str, Any]:
         "warnings": [words(text) for text in (report.smoke, results.set_aside) if text],
         "short": report.short,
         "folded": page.FOLDED,
+        "span": SPAN,
         "tally": page.verdicts(report.claims),
         "gaps": [words(gap) for gap in report.gaps],
         "claims": [page.card(claim) for claim in report.claims],
@@ -538,6 +544,7 @@ def _plain(claim: Claim) -> dict[str, object]:
     """A claim as JSON: NaN, which JSON has not, as null."""
     ours = {
         name: {key: None if math.isnan(value) else value for key, value in x._asdict().items()}
+        | {"range": isinstance(x, Range)}
         for name, x in claim.ours.items()
     }
     return claim._asdict() | {"ours": ours, "provisional": claim.provisional}

@@ -17,9 +17,8 @@ from scipy.optimize import isotonic_regression
 
 from reports.data.frame import FINAL, Results
 from reports.data.paper import Curves
-from reports.data.stats import FEW
 from reports.render.canvas import FAINT, MARGIN, QUIET, Drawing, blank, foot, head, look, save, styled
-from reports.render.tables import describe_task, joined, number, readable, seeds, steps
+from reports.render.tables import describe_task, joined, number, readable, seeds, spans, steps
 
 __all__ = ["Drawing", "each_arm", "footer", "learning_curves", "save", "spread"]
 
@@ -48,7 +47,7 @@ class Label(NamedTuple):
 
 
 def learning_curves(results: Results, spec: Curves) -> Drawing | None:
-    """Every arm of the study with its 95 % band, yardsticks and the paper's levels as lines.
+    """Every arm of the study with its band over seeds, yardsticks and the paper's levels as lines.
 
     Returns:
         None if the study has no points at all.
@@ -150,11 +149,10 @@ def footer(results: Results, spec: Curves, *, levels: bool = True) -> str:
     counts = sorted({len(results.plan(spec.study, arm)) for arm in results.arms(spec.study)})
     prints = ", ".join(sorted(set(plan["fingerprint"].dropna().astype(str)) - {""})) or "unknown"
     budget = results.budget(spec.study)
-    few = f" (fewer than {FEW} seeds: narrower than 95 %)" if 1 < counts[0] < FEW else ""
-    few = " (none with one seed)" if counts[0] == 1 else few
     first = f"profile: {results.profile}, {steps(budget) if budget else 'unknown'} steps, "
     first += f"{'–'.join(map(str, counts))} {'seed' if counts == [1] else 'seeds'}"
-    lines = f"lines: mean over seeds of greedy evaluation; band: 95 % bootstrap interval of the mean{few}"
+    band = spans(n for rows in _curves(results, spec.study).values() for n in rows["n"])
+    lines = f"lines: mean over seeds of greedy evaluation; band: {band}"
     names = ["names: final return"]
     names += (
         ["dotted: the paper's values"] if levels and any(arm in spec.levels for arm in results.arms(spec.study)) else []

@@ -8,11 +8,12 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from reports.data.escaping import latex, line, markdown
-from reports.data.frame import FINAL, METHOD, OWN, PLACE, TOLD, Results, adopted
+from reports.data.frame import EPISODE_ERROR, FINAL, METHOD, OWN, PLACE, TOLD, Results, adopted
 from reports.data.paper import Paper
-from reports.data.stats import LEVEL, Interval, change, improvement, interval, iqm
+from reports.data.stats import FEW, LEVEL, Interval, Range, change, improvement, interval, iqm
 
 NONE = "–"  # where there is nothing to show
+SPAN = "[95 %] or (range)"  # the two forms of `estimate`, in a heading
 TABLES, MEASURED = "tables", "measured"  # folders; in the second is what depends on machine, commit or time
 
 
@@ -99,11 +100,11 @@ def table_2(results: Results, paper: Paper) -> Table:
                 "Paper: final": number(theirs),
                 "Paper: change, stated": percent(stated),
                 "recomputed": percent(recomputed),
-                "Ours: final [95 %]": estimate(interval(values) if len(values) else None),
+                f"Ours: final {SPAN}": estimate(interval(values) if len(values) else None),
                 "IQM": number(ours["iqm"]),
                 "Seeds": seeds(results, study, arm),
-                "Change [95 %]": estimate(lost, percent),
-                "P(full better)": estimate(worse, lambda x: f"{x:.2f}"),
+                f"Change {SPAN}": estimate(lost, percent),
+                "P(full better) [95 %]": estimate(worse, lambda x: f"{x:.2f}"),
             }
         )
     return Table("Table 2: ablation, final return", pd.DataFrame(numbers), pd.DataFrame(shown))
@@ -120,17 +121,40 @@ def finals(results: Results, study: str) -> Table:
         values = results.finals(study, arm)
         ours = _estimates(values)
         low, high = (values.min(), values.max()) if len(values) else (np.nan, np.nan)
-        numbers.append({"study": study, "arm": arm} | ours | {"worst_seed": low, "best_seed": high})
+        errors = results.finals(study, arm, EPISODE_ERROR)
+        luck = float(np.sqrt(np.mean(errors**2))) if len(errors) else np.nan
+        numbers.append(
+            {"study": study, "arm": arm} | ours | {"worst_seed": low, "best_seed": high, "episode_error": luck}
+        )
         shown.append(
             {
                 "Arm": arm,
-                "Final return [95 %]": estimate(interval(values) if len(values) else None),
-                "IQM [95 %]": estimate(interval(values, iqm) if len(values) else None),
+                f"Final return {SPAN}": estimate(interval(values) if len(values) else None),
+                f"IQM {SPAN}": estimate(interval(values, iqm) if len(values) else None),
                 "Worst and best seed": f"{number(low)}, {number(high)}" if len(values) else NONE,
                 "Seeds": seeds(results, study, arm),
             }
         )
-    return Table(f"Final results of study {study}", pd.DataFrame(numbers), pd.DataFrame(shown))
+    return Table(f"Final results of study {study}", pd.DataFrame(numbers), pd.DataFrame(shown), _luck(results, study))
+
+
+def _luck(results: Results, study: str) -> str:
+    """What the evaluation episodes add to a final return, in words; none where no run says it."""
+    errors = np.concatenate(
+        [results.finals(study, arm, EPISODE_ERROR) for arm in results.arms(study)] or [np.array([])]
+    )
+    errors = errors[errors > 0]  # a single episode has none
+    if not len(errors):
+        return ""
+    span, episodes = (
+        " to ".join(dict.fromkeys(number(x, 2) for x in np.sort(errors)[[0, -1]])),
+        results.final_episodes(study),
+    )
+    return (
+        f"Luck of the evaluation episodes: the standard error of one run's final return is {span} points"
+        f"{f' ({episodes:,} episodes)' if episodes else ''}. All runs play the same episodes: what their luck has in "
+        "common is not in the intervals and ranges, and cancels in the difference of two arms."
+    )
 
 
 def steadiness(results: Results, study: str) -> Table:
@@ -297,12 +321,24 @@ def percent(x: float) -> str:
 
 
 def estimate(found: Interval | None, show: Callable[[float], str] = number) -> str:
-    """`66.1 [64.0, 67.9]`, without the brackets if one seed gives no interval."""
+    """`66.1 [64.0, 67.9]`; `66.1 (64.0 to 67.9)` if it is a range; without brackets if one seed gives neither."""
     if found is None or np.isnan(found.value):
         return NONE
     if np.isnan(found.low):
         return show(found.value)
-    return f"{show(found.value)} [{show(found.low)}, {show(found.high)}]"
+    value, low, high = map(show, (found.value, found.low, found.high))
+    return f"{value} ({low} to {high})" if isinstance(found, Range) else f"{value} [{low}, {high}]"
+
+
+def spans(counts: Iterable[int]) -> str:
+    """The name of what stands around a mean over seeds. counts: of seeds, of every mean of a figure."""
+    found = set(counts)
+    kinds = {
+        "95 % bootstrap interval": max(found, default=0) >= FEW,
+        f"range over fewer than {FEW} seeds": found & {*range(2, FEW)},
+    }
+    parts = [" or ".join(name for name, there in kinds.items() if there), "none with one seed" if 1 in found else ""]
+    return ", ".join(filter(None, parts))
 
 
 def steps(x: float) -> str:
@@ -315,7 +351,8 @@ def steps(x: float) -> str:
 def _estimates(values: NDArray[np.float64]) -> dict[str, float]:
     found = interval(values) if len(values) else Interval(np.nan, np.nan, np.nan, 0)
     middle = float(iqm(values)) if len(values) else np.nan
-    return _columns("mean", found) | {"iqm": middle, "seeds": found.n, "level": LEVEL}
+    level = np.nan if isinstance(found, Range) or np.isnan(found.low) else LEVEL
+    return _columns("mean", found) | {"iqm": middle, "seeds": found.n, "level": level}
 
 
 def _columns(name: str, found: Interval | None) -> dict[str, float]:

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.colors import to_hex
+from scipy.stats import f, t
 
 from reports.analyses import readings
 from reports.data.escaping import stem
@@ -73,7 +74,7 @@ def test_intervals_share_the_pooled_variance(tmp_path: Path) -> None:
     reach = 2.0369 * np.sqrt(0.5 * 2 / 2)  # t with 32 degrees; each pair of seeds has variance 0.5
     for value, effect in zip(readings.intervals(found), found.effects, strict=True):
         assert (value.value, value.low, value.high) == pytest.approx((effect, effect - reach, effect + reach), abs=1e-4)
-    single = found._replace(full=found.full[:, :1], other=found.other[:, :1])
+    single = replace(found, full=found.full[:, :1], other=found.other[:, :1])
     assert all(np.isnan(value.low) for value in readings.intervals(single))
 
 
@@ -105,6 +106,89 @@ def test_the_model_agrees_with_the_means_of_a_balanced_design_and_its_analysis_o
     reach = 2.2281 * np.sqrt(left / free / 8)  # t with 10 degrees; a level of two has 8 readings
     row = fit.levels.set_index(["factor", "level"]).loc[("encoder", "mlp")]
     assert (row["high"] - row["effect"], row["effect"] - row["low"]) == pytest.approx((reach, reach), rel=1e-4)
+
+
+def by_hand(found: readings.Contrast) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """The linear model from its normal equations, for designs that determine all of it: levels and factors."""
+    blocks = {}
+    for name in found.levels.columns:
+        names = sorted(set(found.levels[name]))
+        codes = np.vstack([np.eye(len(names) - 1), -np.ones(len(names) - 1)])  # the last level is less all others
+        blocks[name] = codes[[names.index(level) for level in found.levels[name]]]
+    design = np.column_stack([np.ones(len(found.levels)), *blocks.values()])
+    inverse = np.linalg.inv(design.T @ design)
+
+    def squares(x: readings.Values) -> float:
+        return float(((found.effects - x @ np.linalg.lstsq(x, found.effects)[0]) ** 2).sum())
+
+    free, terms, at = len(design) - design.shape[1], inverse @ design.T @ found.effects, 1
+    variance = squares(design) / free
+    rows, tests = [], []
+    for name, block in blocks.items():
+        columns = np.arange(at, at := at + block.shape[1])
+        ratio = (squares(np.delete(design, columns, 1)) / variance - free) / len(columns)
+        tests.append((name, ratio, f.sf(ratio, len(columns), free)))
+        for level in dict.fromkeys(found.levels[name]):
+            here = (found.levels[name] == level).to_numpy()
+            weights = np.eye(len(terms))[0]
+            weights[columns] = block[here][0]
+            value, reach = weights @ terms, t.ppf(0.975, free) * np.sqrt(variance * weights @ inverse @ weights)
+            rows.append((name, level, here.sum(), value, value - reach, value + reach))
+    levels = pd.DataFrame(rows, columns=["factor", "level", "readings", "effect", "low", "high"])
+    return levels, pd.DataFrame(tests, columns=["factor", "f", "p"])
+
+
+def random(rows: list[tuple[str, ...]], names: tuple[str, ...] = tuple(FACTORS)) -> readings.Contrast:
+    """A contrast with these levels whose effects are noise."""
+    levels = pd.DataFrame(rows, columns=list(names))
+    values = np.random.default_rng(len(rows)).normal(size=(2, len(rows), 2))
+    return readings.Contrast("no regulation", levels, values[0], values[1], 0)
+
+
+@pytest.mark.parametrize("count", [16, 13, 9, 8])
+def test_the_model_agrees_with_its_normal_equations_in_any_design(count: int) -> None:
+    every = list(product(*FACTORS.values()))
+    found = random([every[n] for n in np.random.default_rng(3).permutation(16)[:count]])
+    levels, factors = by_hand(found)
+    pd.testing.assert_frame_equal(found.fit.levels, levels)
+    pd.testing.assert_frame_equal(found.fit.factors.drop(columns="p_corrected"), factors)
+
+
+def test_a_saturated_model_has_effects_and_no_intervals() -> None:
+    rows = [("0.02", "mlp", "1"), ("0.02", "pairwise", "2"), ("1", "mlp", "2"), ("1", "pairwise", "1")]
+    fit = random(rows).fit
+    assert np.isfinite(fit.levels["effect"]).all()
+    assert fit.levels[["low", "high"]].isna().all(axis=None)
+    assert fit.factors[["f", "p", "p_corrected"]].isna().all(axis=None)
+
+
+def test_what_the_readings_do_not_determine_is_nan() -> None:
+    rows = [("0.02", "mlp", level) for level in "1122"] + [("1", "pairwise", level) for level in "1122"]
+    fit = random(rows).fit  # no reading tells alpha from the encoder
+    known = fit.levels["factor"] == "lr"
+    assert np.isfinite(fit.levels[known][["effect", "low", "high"]]).all(axis=None)
+    assert fit.levels[~known][["effect", "low", "high"]].isna().all(axis=None)
+    assert fit.factors["p"].isna().tolist() == [True, True, False]
+    assert fit.factors["p_corrected"].iloc[2] == fit.factors["p"].iloc[2]
+
+
+def test_a_factor_of_which_one_level_is_finished_has_no_test() -> None:
+    fit = random([("0.02", "mlp", level) for level in "11122"]).fit
+    assert fit.factors["p"].isna().tolist() == [True, True, False]
+    assert fit.levels["readings"].tolist() == [5, 5, 3, 2]
+
+
+def test_factors_may_have_any_name() -> None:
+    rows = list(product(*FACTORS.values()))
+    odd = random(rows, ("C(a) + b", "", "'x\"")).fit
+    assert odd.levels["effect"].tolist() == random(rows).fit.levels["effect"].tolist()
+
+
+def test_what_a_report_needs_often_is_worked_out_once(tmp_path: Path) -> None:
+    results = read(tmp_path, by_alpha)
+    assert one(results) is one(results)
+    assert one(results).fit is one(results).fit
+    assert one(replace(results)) is not one(results)
 
 
 def test_the_deciding_factor_is_found_and_the_others_are_not(tmp_path: Path) -> None:
@@ -213,7 +297,7 @@ def test_a_study_with_readings_has_its_own_tables_and_figures(tmp_path: Path) ->
 def test_the_table_of_all_contrasts_has_what_the_table_of_each_has(tmp_path: Path) -> None:
     results = read(tmp_path, by_alpha, drop="no regulation, reading=111")
     found = one(results)
-    both = readings.curves(results, "read", [found, found._replace(without="no filter", missing=0)])
+    both = readings.curves(results, "read", [found, replace(found, without="no filter", missing=0)])
     single = readings.curve(results, "read", found)
     for place, arm in enumerate(("no regulation", "no filter")):
         part = slice(15 * place, 15 * place + 15)

@@ -89,7 +89,7 @@ def test_what_has_no_run_is_missing_and_not_zero(tmp_path: Path) -> None:
     assert len(drawing.numbers) == 5
     assert any("no finished run yet: IQL with 6" in t.get_text() for t in drawing.figure.findobj(Text))  # type: ignore[attr-defined]
     shown = scaling.table(results, found).shown.set_index("Method")
-    assert shown.loc["IQL", "6 agents"] == "– (0 of 5)"
+    assert shown.loc["IQL", "6 agents"] == "–; 0 of 5 seeds"
     assert shown.loc["IQL", "4 agents"].startswith("60.0 [59.")
 
 

@@ -151,8 +151,28 @@ def test_the_resamples_are_those_of_the_published_reports() -> None:
     assert found == pytest.approx((-0.8681854109982297, -4.249533404232246, 3.887641473663647, 5), abs=1e-9)
 
 
-def test_fewer_than_five_seeds_are_few() -> None:
-    assert [stats.interval(drawn(n)).few for n in (2, 4, 5, 6)] == [True, True, False, False]
+@pytest.mark.parametrize("n", [2, 3, 4])
+def test_fewer_than_five_seeds_give_their_range_and_no_interval(n: int) -> None:
+    x, y = drawn(n), drawn(7, 1)
+    assert type(stats.interval(x)) is stats.Range
+    assert stats.interval(x) == pytest.approx((x.mean(), x.min(), x.max(), n))
+    assert stats.interval(x, stats.iqm)[1:3] == pytest.approx((x.min(), x.max()))
+    assert all(type(found) is stats.Range for found in (stats.difference(x, y), stats.change(y, x)))
+    points = pd.DataFrame({"seed": range(n), "step": 0, "value": x})
+    assert stats.curve(points)[["low", "high"]].to_numpy()[0] == pytest.approx((x.min(), x.max()))
+
+
+def test_a_range_of_a_difference_is_every_seed_against_every_other() -> None:
+    x, y = drawn(3), drawn(3, 1)
+    assert stats.difference(x, y)[1:3] == pytest.approx((x.min() - y.max(), x.max() - y.min()))
+
+
+def test_five_seeds_give_an_interval_and_so_does_what_is_no_bootstrap() -> None:
+    x = drawn(5)
+    assert type(stats.interval(x)) is stats.Interval
+    assert x.min() < stats.interval(x).low < stats.interval(x).high < x.max()
+    assert type(stats.improvement(drawn(3), drawn(3, 1))) is stats.Interval
+    assert type(stats.interval(drawn(1))) is stats.Interval
 
 
 def test_the_ends_of_an_interval_belong_to_it() -> None:

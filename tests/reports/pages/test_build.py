@@ -126,7 +126,9 @@ def test_claims_as_json(made: Path) -> None:
         "rhmc study run studies/ablation.yaml --profile quick && rhmc export studies/ablation.yaml --profile quick && "
         "rhmc report --profile quick"
     ]
-    assert found["C13"]["ours"]["4 x 3 x 5: % lost"] == {"value": 4.0, "low": None, "high": None, "n": 1}
+    lost = found["C13"]["ours"]["4 x 3 x 5: % lost"]
+    assert lost == {"value": 4.0, "low": None, "high": None, "n": 1, "range": False}
+    assert found["C8"]["ours"]["full"]["range"] is True
 
 
 def test_table_1(runs: Path, made: Path) -> None:
@@ -176,7 +178,7 @@ def test_table_2(runs: Path) -> None:
     assert rows["paper_change_stated"].tolist()[1:3] == [-50.9, -21.4]
     assert rows["probability_full_better"].tolist()[1:] == [1, 1, 1]
     shown = table.shown.set_index("Method")
-    assert shown.loc["Full RHMC", "Ours: final [95 %]"] == "71.0 [69.0, 74.0]"
+    assert shown.loc["Full RHMC", f"Ours: final {tables.SPAN}"] == "71.0 (69.0 to 74.0)"
     assert shown.loc["IQL", "Paper: final"] == tables.NONE
 
 
@@ -188,10 +190,10 @@ def test_table_2_shows_a_missing_arm_as_missing(tmp_path: Path) -> None:
     table = tables.table_2(load(folder, "quick"), read())
     rows, shown = table.numbers.set_index("arm"), table.shown.set_index("Method")
     assert np.isnan(rows.loc["no regulation", ["mean", "change", "iqm"]].astype(float)).all()
-    assert shown["Ours: final [95 %]"]["Without regulation mechanism"] == "–"
+    assert shown[f"Ours: final {tables.SPAN}"]["Without regulation mechanism"] == "–"
     assert shown["Seeds"]["Without regulation mechanism"] == "missing"
     assert shown.loc["Without target-conditioned filter", "Seeds"] == "1 of 3"
-    assert shown.loc["Without target-conditioned filter", "Ours: final [95 %]"] == "60.0"  # a seed, no interval
+    assert shown.loc["Without target-conditioned filter", f"Ours: final {tables.SPAN}"] == "60.0"  # a seed, no interval
 
 
 def test_final_table_is_in_order_of_the_mean(runs: Path) -> None:

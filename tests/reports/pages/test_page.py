@@ -92,7 +92,7 @@ def test_claims_come_first_with_all_that_belongs_to_them(read: Reader) -> None:
     for words in (
         "Without the regulation mechanism the final reward falls.",
         "70.5 to 35.6 (Table 2)",
-        "full − no regulation: 10.0 [",
+        "full − no regulation: 10.0 (",
         "rhmc study run studies/ablation.yaml --profile quick && rhmc export",
         "4 x 3 x 5: % lost: 4.0",
         "C13",
