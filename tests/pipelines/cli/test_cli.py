@@ -517,7 +517,7 @@ def test_all_yardsticks_are_the_same_whatever_is_played_at_a_time(
 
 
 def test_all_yardsticks_are_those_that_an_evaluation_at_a_time_gives(rhmc: Rhmc, small: None) -> None:
-    said = rhmc("yardsticks", "all", "--out", "o")
+    said = rhmc("yardsticks", "all", "--out", "o", "--jobs", "1")
     lines = [line.split() for line in said.out.splitlines() if line.strip() and "─" not in line]
     assert lines[0] == ["task", "policy", "coverage", "or", "return", "sem"]
     tasks = {tuple(line[:-3]) for line in lines[1:]}
@@ -535,7 +535,7 @@ def test_all_yardsticks_are_those_that_an_evaluation_at_a_time_gives(rhmc: Rhmc,
 
 
 def test_all_yardsticks_bring_a_folder_up_to_date(rhmc: Rhmc, small: None) -> None:
-    rhmc("yardsticks", "all", "--out", "o")
+    rhmc("yardsticks", "all", "--out", "o", "--jobs", "1")
     before = [Path("o", name).read_bytes() for name in ("yardsticks.parquet", "yardsticks.runs.parquet")]
     rhmc("yardsticks", "navigation", "--reward", "mpe1", "--episodes", "20", "--out", "o", "--policies", "nearest")
     assert Path("o/yardsticks.parquet").read_bytes() != before[0]
