@@ -29,6 +29,7 @@ from pipelines.workspace.process_pool import KILLED
 from pipelines.workspace.provenance import host
 from rhmc.yardsticks.scores import names
 from tests.pipelines.support import Said, jobs_of, run_rhmc
+from tests.pipelines.workspace.pooled import die
 from tests.robustness.fleet import wait_for
 
 ROOT = Path(__file__).parents[3]
@@ -600,15 +601,10 @@ def test_all_yardsticks_are_not_played_for_nothing(
 
 
 def test_a_worker_that_is_killed_writes_nothing(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipelines.export.yardsticks._play", die)
+    monkeypatch.setattr("pipelines.export.yardsticks._play", die)  # the effect of a lack of memory on a worker
     said = rhmc("yardsticks", "all", "--out", "o")
     assert (said.code, said.out, said.err) == (2, "", KILLED + "\n")
     assert not Path("o").exists()
-
-
-def die(evaluation: yardsticks.Evaluation) -> None:
-    """The effect of a lack of memory on a worker."""
-    os.kill(os.getpid(), signal.SIGKILL)
 
 
 # The rest

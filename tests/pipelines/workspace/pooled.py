@@ -46,10 +46,15 @@ def shared(tensor: torch.Tensor) -> tuple[bool, torch.Tensor]:
     return tensor.is_shared(), tensor + 1
 
 
+def die(item: object) -> None:
+    """Dies, as for want of memory."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
 def killed(item: int) -> int:
     """Dies, if it is the second."""
     if item == 1:
-        os.kill(os.getpid(), signal.SIGKILL)
+        die(item)
     return item
 
 
