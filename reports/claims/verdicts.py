@@ -12,7 +12,7 @@ from reports.data.escaping import markdown
 from reports.data.frame import THEOREM, YARDSTICKS, Results
 from reports.data.paper import Paper, PaperError
 from reports.data.stats import FEW, Interval
-from reports.render.tables import NONE, Table, estimate, joined, number, percent, steps
+from reports.render.tables import NONE, SPAN, Table, estimate, joined, number, percent, steps
 
 __all__ = [
     "JUDGED",
@@ -117,7 +117,7 @@ def table(claims: Sequence[Claim]) -> Table:
             "Claim": claim.id,
             "The paper says": markdown(claim.text),
             "Paper": markdown(f"{claim.paper} ({claim.place})"),
-            "Ours [95 %]": "<br>".join(markdown(f"{name} {value}") for name, value in described(claim.ours)) or NONE,
+            f"Ours {SPAN}": "<br>".join(markdown(f"{name} {value}") for name, value in described(claim.ours)) or NONE,
             "Verdict": f"**{claim.judgement}**",
             "Why": " ".join(
                 [markdown(claim.reason)]
