@@ -346,7 +346,9 @@ def _near(see: Evidence, arm: str, level: float) -> Finding:
     words = f"{arm} ends at {number(ours.value)}, {'near' if holds else 'not shown to be near'} {level:g}."
     listed = joined(f"{name} ({number(x)})" for name, x in rules.items())
     return Finding(
-        _whether(holds), words + (f" So do policies that do not learn: {listed}." if rules else ""), {arm: ours}
+        _whether(holds),
+        words + (f" Policies that do not learn and end within {NEAR:g} points of it: {listed}." if rules else ""),
+        {arm: ours},
     )
 
 
@@ -375,7 +377,7 @@ def _steady_without_learning(see: Evidence, counts: Sequence[int]) -> str:
     tables = [see.scripted(SCALING, agents=count) for count in counts]
     common = [name for name in tables[0] if all(name in table for table in tables)]
     steady = [name for name in common if np.all(np.diff([table[name] for table in tables]) > -NEAR)]
-    return f" So are policies that do not learn: {joined(steady)}." if steady else ""
+    return f" Policies that do not learn and fall by no more either: {joined(steady)}." if steady else ""
 
 
 def _order(see: Evidence, arm: str) -> Finding:

@@ -134,7 +134,9 @@ def test_a_level_that_policies_without_learning_have_says_so(tmp_path: Path) -> 
     found = verdicts(
         tmp_path, study("coverage", arms(70.5), steps=PAPER), yardsticks({"a_bound": 70.0, "planner": 73.9})
     )
-    assert found["C3b"].reason == ("RHMC ends at 70.5, near 70.5. So do policies that do not learn: planner (73.9).")
+    assert found["C3b"].reason == (
+        "RHMC ends at 70.5, near 70.5. Policies that do not learn and end within 5 points of it: planner (73.9)."
+    )
     assert "do not learn" not in found["C4a"].reason
 
 
@@ -296,7 +298,7 @@ def test_stability_that_needs_no_learning_says_so(tmp_path: Path) -> None:
         for part in both
     )
     found = verdicts(tmp_path, sensors([50, 60], [40, 50]), both)  # type: ignore[arg-type]
-    assert found["C7b"].reason == "Stable. So are policies that do not learn: nearest."
+    assert found["C7b"].reason == "Stable. Policies that do not learn and fall by no more either: nearest."
 
 
 # The parts of RHMC
