@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import NamedTuple
 
-from reports.analyses import alpha, beyond, comparison, readings, scaling
+from reports.analyses import alpha, beyond, comparison, readings, scaling, searches
 from reports.analyses.scaling import Sweep
 from reports.data.drawn import Counterexample, Scenes
 from reports.data.escaping import stem
@@ -70,7 +70,8 @@ def gallery(results: Results, paper: Paper) -> list[Picture]:
         spec = paper.figures[known[study]] if study in known else paper.curves_of(study, results.task(study))
         drawn += _curves(results, spec, known.get(study, f"curves_{stem(study)}"))
     own = sorted((p for p in drawn if p.name.startswith(PAPERS)), key=lambda p: _order(p.name))
-    return own + [p for p in drawn if not p.name.startswith(PAPERS)] + list(comparisons(results))
+    others = [p for p in drawn if not p.name.startswith(PAPERS)]
+    return [*own, *others, *comparisons(results), *(p for name in results.searches for p in search_gallery(results, name))]
 
 
 def in_short(results: Results, paper: Paper) -> list[str]:
@@ -101,6 +102,23 @@ def study_gallery(results: Results, paper: Paper, study: str) -> list[Picture]:
         *_sweep(results, study, f"scaling_{stem(study)}"),
         *comparisons(results),
     ]
+
+
+def search_gallery(results: Results, search: str) -> Iterator[Picture]:
+    """The figure of a search."""
+    which = f"studies/{search}.yaml --profile {results.profile}"
+    behind = f"rhmc search run {which}"
+    title = f"Best objective by number of trials, search {search}"
+    yield from picture(f"trials_{stem(search)}", title, partial(_trials, results, search), search, behind)
+
+
+def _trials(results: Results, search: str) -> Made | None:
+    drawing = searches.fig_trials(results, search)
+    caption = (
+        "See where each line last rises: an arm that still gains at the right edge would gain from more trials, and one "
+        "that is flat for long would not. The height at a number of trials is what that budget would have found."
+    )
+    return (caption, searches.described(results, search), drawing) if drawing else None
 
 
 def comparisons(results: Results) -> Iterator[Picture]:
