@@ -27,6 +27,8 @@ export DVC_SITE_CACHE_DIR := $(CURDIR)/.dvc/tmp/site
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_NO_INPUT := 1
 unexport PYTHONPATH
+# Each of the processes that tests and studies start would compile the project again.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help setup repro test deep check bench soak report ui lock clean
 
@@ -57,7 +59,7 @@ deep: $(READY) ## Every test, with many more random kills and examples: before a
 check: $(READY) ## Lint and types only
 	@ruff check --quiet .
 	@ruff format --quiet --check . || { echo "Run \`ruff format .\`"; exit 1; }
-	@mypy --no-error-summary
+	@mypy --no-error-summary --num-workers auto
 
 bench: $(READY) ## Speed of the environments and of training, as Markdown tables
 	@python benchmarks/env_speed.py
@@ -82,7 +84,8 @@ clean: ## Remove .venv and caches; results stay
 	@find rhmc pipelines reports benchmarks tests -name __pycache__ -prune -exec rm -rf {} +
 	@echo "Removed .venv and the caches. Kept every result: work/ (runs, checkpoints) and results/ (remove by hand)."
 
-# torch comes first and alone, so that a build with CUDA is seen before its packages are fetched.
+# torch comes first and alone, so that a build with CUDA is seen before its packages are fetched. All is compiled at the
+# end, by every processor, but the packages' own tests; some files are for other versions of Python.
 $(READY): requirements.lock pyproject.toml
 	@test -n "$(PYTHON)" || { echo "Python 3.11, 3.12 or 3.13 is needed, and none is on the path." \
 	  "Give its path: make PYTHON=/path/to/python3.11"; exit 1; }
@@ -90,10 +93,11 @@ $(READY): requirements.lock pyproject.toml
 	  "Give the path of one: make PYTHON=/path/to/python3.11"; exit 1; }
 	@echo "Setting up .venv: some minutes, 2.3 GB"
 	@test -x .venv/bin/python || $(PYTHON) -m venv .venv
-	@python -m pip install --quiet --no-deps $(PIP_TORCH_ARGS) "$$(grep '^torch==' requirements.lock)"
+	@python -m pip install --quiet --no-compile --no-deps $(PIP_TORCH_ARGS) "$$(grep '^torch==' requirements.lock)"
 	@python .ci/cpu_only.py
-	@python -m pip install --quiet -r requirements.lock
+	@python -m pip install --quiet --no-compile -r requirements.lock
 	@python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	@python .ci/cpu_only.py
 	@python -m pip check
+	@python -m compileall -qq -j 0 -x '/tests?/' .venv/lib || true
 	@touch $(READY)

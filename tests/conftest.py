@@ -3,6 +3,7 @@
 Results of larger layers depend on the number of threads.
 """
 
+import gc
 import os
 import shutil
 from collections.abc import Iterator
@@ -43,6 +44,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if ROOMS & set(item.path.parents):
             for warning in KNOWN:
                 item.add_marker(pytest.mark.filterwarnings(warning))
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Leave what the imports made, most of a million objects, out of every collection of garbage from here on."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

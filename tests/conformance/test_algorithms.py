@@ -1,6 +1,7 @@
 """The requirements on every method of the table, on both encoders and both tasks; and RHMC in its variants."""
 
 from collections.abc import Iterator
+from copy import deepcopy
 from functools import cache
 from itertools import islice, product
 from operator import attrgetter
@@ -161,7 +162,7 @@ def test_a_run_continues_from_any_point_bit_for_bit(case: Case) -> None:
     last = len(full.states) - 1
     for point, state in enumerate(full.states[:-1]):
         run, end = trainer(case, seed=99), last if point == 0 else point + 1
-        run.load_state_dict(through_a_file(state))  # a copy: what training changes in place is looked at again
+        run.load_state_dict(deepcopy(state))  # what training changes in place is looked at again
         assert assert_same(run.state_dict(), state) > 40
         assert list(islice(run, end - point)) == full.metrics[point + 1 : end + 1]
         assert_same(run.state_dict(), full.states[end])
@@ -171,7 +172,7 @@ def test_a_run_continues_from_any_point_bit_for_bit(case: Case) -> None:
 def test_a_checkpoint_replaces_whatever_a_trainer_was_doing(case: Case) -> None:
     full, run = whole(case), trainer(case, seed=5)
     list(run)
-    run.load_state_dict(through_a_file(full.states[2]))
+    run.load_state_dict(deepcopy(full.states[2]))
     assert list(run) == full.metrics[3:]
     assert_same(run.state_dict(), full.states[-1])
 
@@ -383,12 +384,12 @@ def test_actions_are_actions_and_nothing_given_is_changed(case: Case, explore: b
     env, obs = world(case.env, batch=6)
     algo = build(case.algo, env)
     carry = algo.carry(6)
-    given = through_a_file({"obs": obs._asdict(), "carry": carry, "algo": algo.state_dict()})
+    given = deepcopy({"obs": obs._asdict(), "carry": carry, "algo": algo.state_dict()})
     rng = seeded()
     action, after, extra = algo.act(obs, carry, rng, explore=explore)
     assert explore or torch.equal(rng.get_state(), seeded().get_state())  # greedy acting draws nothing
     assert_actions(action, env, 6)
-    assert_same(through_a_file({"obs": obs._asdict(), "carry": carry, "algo": algo.state_dict()}), given)
+    assert_same({"obs": obs._asdict(), "carry": carry, "algo": algo.state_dict()}, given)
     assert {k: v.shape for k, v in after.items()} == {k: v.shape for k, v in carry.items()}
     assert all(len(v) == 6 and not v.requires_grad for v in (*after.values(), *extra.values()))
 
@@ -677,14 +678,14 @@ STEPS = {"coma": 18_000, "hitmac": 14_000}  # 12 000 else
 
 
 def returns(kind: str, **changes: Any) -> Iterator[float]:
-    """A method's mean return in the tiny task before learning and at each sixth of its steps."""
+    """A method's mean return in the tiny task before learning and at each twelfth of its steps."""
     config = ALGORITHMS[kind].config
     wanted = LEARNING | LEARNING_OF.get(kind, {})
     known = fitted(config, wanted)
     run = Trainer(
         toy.Config(),  # type: ignore[arg-type]
         config(**nested(known | changes)),
-        Config(steps=STEPS.get(kind, 12_000), num_envs=32, evaluations=6, eval_episodes=300, final_episodes=1),
+        Config(steps=STEPS.get(kind, 12_000), num_envs=32, evaluations=12, eval_episodes=300, final_episodes=1),
         seed=0,
     )
     return (item["eval/return"] for item in run)

@@ -23,7 +23,7 @@ from rhmc.training.trainer import Trainer
 from rhmc.yardsticks.scores import play_yardsticks
 from tests.blocks import fitted, nested
 from tests.memory_tracker import MemoryTracker
-from tests.pipelines.support import tiny
+from tests.pipelines.support import lasting, tiny
 
 FILE = Path(__file__).with_name("digests.json")
 DIGITS = 12
@@ -93,7 +93,7 @@ def _yardsticks(task: str) -> Callable[[], str]:
 
 def _table() -> str:
     """The bytes of a study's exported values, as its report reads them; not of its runs, which name the code."""
-    study = tiny()
+    study = lasting(tiny())
     tracker = MemoryTracker(study_card(study), [])
     for item in items(study):
         log = tracker.start(item.card)

@@ -1,4 +1,4 @@
-"""A tiny study, also as a program: `python -m tests.pipelines.support HOME POINTS CONCURRENT` launches it."""
+"""A tiny study; `python -m tests.pipelines.support HOME POINTS CONCURRENT` launches one with time to be killed in."""
 
 import os
 import shutil
@@ -19,16 +19,17 @@ from pipelines.specs.study import Resources, RunSpec, Setting, Study
 from pipelines.tracking.plan import Item, items
 from pipelines.workspace.process_pool import side_by_side
 from rhmc.algorithms import ALGORITHMS
+from rhmc.envs import coverage
 from tests.blocks import fitted, nested
 
-CODE = code_id("iql", "coverage")  # of all runs here
+CODE = code_id("iql", "navigation")  # of all runs here
 
 
 def setting(**algo: Any) -> Setting:
-    """Coverage with two sensors and IQL, a fraction of a second of training."""
+    """Navigation with two agents and IQL, a fraction of a second: most of it is play, so episodes are short."""
     return Setting.model_validate(
         {
-            "env": {"kind": "coverage", "preset": "flat", "agents": 2, "targets": 2},
+            "env": {"kind": "navigation", "agents": 2, "episode": 7},
             "algo": {
                 "kind": "iql",
                 "learning_starts": 64,
@@ -74,6 +75,13 @@ def tiny(
         steps=200 * points,
         resources=Resources(checkpoint_every=every, concurrent=concurrent),
     )
+
+
+def lasting(study: Study) -> Study:
+    """The study in coverage, whose long episodes make a point take a fraction of a second: time to be killed in."""
+    env = coverage.Config(agents=2, targets=2)
+    arms = {arm: one.model_copy(update={"env": env}) for arm, one in study.arms.items()}
+    return study.model_copy(update={"base": next(iter(arms.values())), "arms": arms})
 
 
 def plan(study: Study | None = None) -> list[Item]:
@@ -150,4 +158,5 @@ def interrupt(home: Path) -> None:
 if __name__ == "__main__":
     from pipelines.execution import run
 
-    sys.exit(run.run_studies([tiny(points=int(sys.argv[2]), concurrent=int(sys.argv[3]))], Path(sys.argv[1])))
+    study = lasting(tiny(points=int(sys.argv[2]), concurrent=int(sys.argv[3])))
+    sys.exit(run.run_studies([study], Path(sys.argv[1])))

@@ -52,6 +52,7 @@ PRELOAD = [  # whatever a launch or another verb imports: a forked process has i
         "pipelines.tracking.registry",
         "pipelines.tuning.search_plots",
         "reports.pages.build",
+        "tests.robustness.warm",
     ),
 ]
 FORKS = multiprocessing.get_context("forkserver")

@@ -42,7 +42,7 @@ STUDY = tiny("killed", 6, {name: setting(lr=1e-2) for name in ("fast", "twin")})
 SEARCH = """\
 question: Which?
 base:
-  env: {kind: coverage, agents: 2, targets: 2}
+  env: {kind: navigation, agents: 2, episode: 7}
   algo: {kind: iql, learning_starts: 64, batch_size: 32, train_freq: 16, hidden_dim: 16, buffer_size: 400}
   trainer: {num_envs: 8, evaluations: 3, eval_episodes: 4, final_episodes: 8}
 arms:

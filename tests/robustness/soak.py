@@ -29,7 +29,7 @@ from pipelines.specs.study import Study
 from pipelines.tracking.mlflow_tracker import create_database, open_existing
 from pipelines.tracking.plan import items, study_card
 from pipelines.workspace.work_folder import Home
-from tests.pipelines.support import setting, started_by, tiny
+from tests.pipelines.support import lasting, setting, started_by, tiny
 from tests.robustness.chaos import WORKER, Run, damage, everything, faults, free_port
 
 KINDS = ("driver", "worker", "server", "driver, politely", "node")
@@ -41,7 +41,7 @@ ATTEMPTS = 40  # launches in a row that may fail without a kill before a study c
 def study(points: int) -> Study:
     """Three trainings, one of them for two arms."""
     rates = {"slow": 1e-4, "fast": 1e-2, "other": 1e-3, "twin": 1e-3}
-    return tiny("soak", points, {arm: setting(lr=rate) for arm, rate in rates.items()})
+    return lasting(tiny("soak", points, {arm: setting(lr=rate) for arm, rate in rates.items()}))
 
 
 class Campaign:

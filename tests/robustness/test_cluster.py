@@ -22,6 +22,7 @@ from pipelines.execution.run import show_status
 from pipelines.execution.seed_group import Seeds
 from pipelines.execution.trainable import RunTrainable
 from pipelines.export.tables import export_study
+from pipelines.specs.identity import code_id
 from pipelines.specs.search import Search
 from pipelines.specs.study import Setting
 from pipelines.tracking.mlflow_tracker import open_existing
@@ -29,7 +30,7 @@ from pipelines.tracking.plan import study_card
 from pipelines.tuning.search_run import search_card, show_search
 from pipelines.workspace.work_folder import Home, StoreError
 from rhmc.types import Metrics
-from tests.pipelines.support import CODE, plan, setting, tiny
+from tests.pipelines.support import lasting, plan, setting, tiny
 from tests.robustness.chaos import everything, faults, launch_here
 from tests.robustness.fleet import (
     ROOT,
@@ -47,7 +48,8 @@ needs_postgres = pytest.mark.skipif(
     PROGRAMS is None, reason="PostgreSQL's initdb and postgres are neither on PATH nor in /usr/lib/postgresql"
 )
 POINTS = 40
-STUDY = tiny(points=POINTS, arms={arm: setting(lr=rate) for arm, rate in {"slow": 1e-4, "fast": 1e-2}.items()})
+STUDY = lasting(tiny(points=POINTS, arms={arm: setting(lr=rate) for arm, rate in {"slow": 1e-4, "fast": 1e-2}.items()}))
+CODE = code_id("iql", "coverage")
 
 
 # An address

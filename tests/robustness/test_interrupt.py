@@ -22,12 +22,12 @@ from pipelines.specs.study import Study
 from pipelines.tracking.mlflow_tracker import open_existing
 from pipelines.tracking.plan import study_card
 from pipelines.workspace.work_folder import Home
-from tests.pipelines.support import all_end, interrupt, started_by, tiny
+from tests.pipelines.support import all_end, interrupt, lasting, started_by, tiny
 from tests.robustness.chaos import WORKER, launch_here
 
 pytestmark = pytest.mark.ray
 POINTS = 16
-STUDY = tiny(points=POINTS, concurrent=1)
+STUDY = lasting(tiny(points=POINTS, concurrent=1))
 
 
 @pytest.fixture(scope="module")

@@ -29,6 +29,7 @@ from pipelines.workspace.process_pool import KILLED
 from pipelines.workspace.provenance import host
 from rhmc.yardsticks.scores import names
 from tests.pipelines.support import Said, jobs_of, run_rhmc
+from tests.pipelines.workspace.pooled import die
 from tests.robustness.fleet import wait_for
 
 ROOT = Path(__file__).parents[3]
@@ -517,7 +518,7 @@ def test_all_yardsticks_are_the_same_whatever_is_played_at_a_time(
 
 
 def test_all_yardsticks_are_those_that_an_evaluation_at_a_time_gives(rhmc: Rhmc, small: None) -> None:
-    said = rhmc("yardsticks", "all", "--out", "o")
+    said = rhmc("yardsticks", "all", "--out", "o", "--jobs", "1")
     lines = [line.split() for line in said.out.splitlines() if line.strip() and "─" not in line]
     assert lines[0] == ["task", "policy", "coverage", "or", "return", "sem"]
     tasks = {tuple(line[:-3]) for line in lines[1:]}
@@ -535,7 +536,7 @@ def test_all_yardsticks_are_those_that_an_evaluation_at_a_time_gives(rhmc: Rhmc,
 
 
 def test_all_yardsticks_bring_a_folder_up_to_date(rhmc: Rhmc, small: None) -> None:
-    rhmc("yardsticks", "all", "--out", "o")
+    rhmc("yardsticks", "all", "--out", "o", "--jobs", "1")
     before = [Path("o", name).read_bytes() for name in ("yardsticks.parquet", "yardsticks.runs.parquet")]
     rhmc("yardsticks", "navigation", "--reward", "mpe1", "--episodes", "20", "--out", "o", "--policies", "nearest")
     assert Path("o/yardsticks.parquet").read_bytes() != before[0]
@@ -600,15 +601,10 @@ def test_all_yardsticks_are_not_played_for_nothing(
 
 
 def test_a_worker_that_is_killed_writes_nothing(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipelines.export.yardsticks._play", die)
+    monkeypatch.setattr("pipelines.export.yardsticks._play", die)  # the effect of a lack of memory on a worker
     said = rhmc("yardsticks", "all", "--out", "o")
     assert (said.code, said.out, said.err) == (2, "", KILLED + "\n")
     assert not Path("o").exists()
-
-
-def die(evaluation: yardsticks.Evaluation) -> None:
-    """The effect of a lack of memory on a worker."""
-    os.kill(os.getpid(), signal.SIGKILL)
 
 
 # The rest

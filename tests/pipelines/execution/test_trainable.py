@@ -373,6 +373,7 @@ def test_a_step_size_that_diverges(start: Start, tmp_path: Path) -> None:
 def test_every_method_is_finite_at_every_point_and_each_of_its_networks_is_looked_at(kind: str) -> None:
     """With the settings under which some value is infinite or undefined although nothing is wrong."""
     few = {"hidden_dim": 4, "batch_size": 8, "learning_starts": 0, "train_freq": 4, "n_steps": 1, "pretrain": 32}
+    few |= {"epochs": 1, "minibatches": 1}
     config = ALGORITHMS[kind].config
     algo = config.model_validate({"kind": kind} | nested(fitted(config, few)))
     if "regulator" in config.model_fields:

@@ -87,7 +87,7 @@ def test_one_row_per_planned_run(tracker: MemoryTracker, tmp_path: Path) -> None
     assert (known["arm"], known["seconds"], known["commit"]) == ("slow", 4.0, "abc-dirty")
     assert known["run"] == slow["run"]
     assert RunSpec.model_validate_json(slow["config"]) == runs[0].spec
-    expected = {"algorithm": "iql", "task": "coverage", "profile": "quick", "fingerprint": CODE, "seed": 0}
+    expected = {"algorithm": "iql", "task": "navigation", "profile": "quick", "fingerprint": CODE, "seed": 0}
     assert slow.items() >= (expected | {"question": "Does the whole chain hold?"}).items()
 
 

@@ -13,9 +13,15 @@ from pipelines.tracking.policy import Saved, load, save
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.work_folder import Checkpoints, Home, save_atomically, without_replay
 from rhmc.algorithms import ALGORITHMS
+from rhmc.envs import coverage
 from rhmc.training.trainer import Trainer
 from rhmc.types import Metrics
 from tests.pipelines.support import setting, spec, tiny
+
+
+@pytest.fixture(autouse=True)
+def _short_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(coverage.PRESETS, "flat", coverage.PRESETS["flat"]._replace(episode=7))
 
 
 def trained(one: RunSpec) -> tuple[Trainer, Metrics]:
@@ -29,8 +35,10 @@ def final(point: Metrics) -> Metrics:
 
 
 def of_kind(kind: str, encoder: str) -> RunSpec:
+    """In coverage, where agents and targets have numbers of their own."""
     fields = {"kind": kind, "encoder": encoder, "hidden_dim": 8}
-    one = setting().model_copy(update={"algo": ALGORITHMS[kind].config.model_validate(fields)})
+    algo = ALGORITHMS[kind].config.model_validate(fields)
+    one = setting().model_copy(update={"env": coverage.Config(agents=2, targets=2), "algo": algo})
     budget = one.trainer.model_copy(update={"steps": 64, "evaluations": 1})
     return RunSpec(**dict(one.model_copy(update={"trainer": budget})), seed=1)
 
@@ -84,11 +92,10 @@ def test_every_method_acts_with_other_numbers_on_the_pairwise_encoder_only(kind:
         (EvaluationEpisodes(targets=0), "--targets: 0 is not allowed; must be greater than or equal to 1"),
     ],
 )
-def test_a_task_that_cannot_be_is_named_by_its_option(
-    policy: tuple[Path, Metrics], wanted: EvaluationEpisodes, said: str
-) -> None:
+def test_a_task_that_cannot_be_is_named_by_its_option(wanted: EvaluationEpisodes, said: str) -> None:
+    one = of_kind("iql", "pairwise")
     with pytest.raises(InputError) as error:
-        score(of_file(policy[0], None), wanted)
+        score(Policy("a", Saved(one, trained(one)[0].state_dict()["algorithm"])), wanted)
     assert str(error.value) == said
 
 

@@ -159,7 +159,7 @@ def test_a_worker_leaves_an_animation_that_changes_nothing(tmp_path: Path) -> No
     assert drawing_one.trainer is not None
     assert same(plain.trainer.state_dict(), drawing_one.trainer.state_dict())
     assert not (tmp_path / "a" / "run0" / "episode.gif").exists()
-    assert len(frames((tmp_path / "b" / "run0" / "episode.gif").read_bytes())) > 10
+    assert len(frames((tmp_path / "b" / "run0" / "episode.gif").read_bytes())) == 1 + 7  # the whole episode
     assert policy.load(tmp_path / "b" / "run0").spec.seed == 0
 
 

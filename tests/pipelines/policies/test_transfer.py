@@ -44,11 +44,11 @@ def test_the_table_holds_what_evaluation_says(tmp_path: Path) -> None:
 def test_several_policies_at_a_time_give_the_same_bytes(tmp_path: Path) -> None:
     policies = [policy(kind=kind) for kind in ("iql", "qmix", "mappo")]
     files = []
-    for jobs in (1, 2, 5):
+    for jobs in (1, 2):
         rows = list(transfer("tiny", iter(policies), [3], [3], 8, jobs))
         assert [row[1] for row in rows] == ["IQL"] * 3 + ["QMIX"] * 3 + ["MAPPO"] * 3
         files.append(export_transfer(rows, tmp_path / str(jobs)).read_bytes())
-    assert files == files[:1] * 3
+    assert files[0] == files[1]
 
 
 def test_a_policy_under_way_goes_to_another_process_without_its_replay(monkeypatch: pytest.MonkeyPatch) -> None:

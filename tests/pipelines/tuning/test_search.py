@@ -51,7 +51,7 @@ ROOT = Path(__file__).parents[3]
 GOOD = """\
 question: Which?
 base:
-  env: {kind: coverage, agents: 2, targets: 2}
+  env: {kind: navigation, agents: 2, episode: 7}
   algo: {kind: iql, learning_starts: 64, batch_size: 32, train_freq: 16, hidden_dim: 16, buffer_size: 400}
   trainer: {num_envs: 8, evaluations: 3, eval_episodes: 4, final_episodes: 8}
 arms:
@@ -904,7 +904,8 @@ def test_a_killed_and_interrupted_search_ends_as_one_that_was_not(
     home: Path, cluster: None, project: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     resources = "resources: {concurrent: 1, checkpoint_every: 1}\n"
-    text = GOOD.replace("evaluations: 3", "evaluations: 4") + MEDIAN + resources
+    long = changed("{kind: navigation, agents: 2, episode: 7}", "{kind: coverage, agents: 2, targets: 2}")
+    text = long.replace("evaluations: 3", "evaluations: 4") + MEDIAN + resources
     search = load(text, "quick", "trials=2", "steps=800")
     shutil.copy(home / "mlflow.db", project / "template.db")
     with pytest.MonkeyPatch.context() as alone:  # without Ray: a worker takes seconds to start, and changes nothing

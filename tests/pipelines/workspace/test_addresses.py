@@ -11,8 +11,9 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from typing import NamedTuple
 from urllib.parse import quote
 
 import psutil
@@ -196,18 +197,35 @@ def no_secret(said: str | bytes) -> bool:
     return not any(form in text for form in (RAW, CODED, repr(RAW)[1:-1], "cr'et", "cr%27et"))
 
 
-def test_the_password_of_a_store_in_use_is_nowhere(place: Path) -> None:
-    programs = postgres_programs()
-    if programs is None:
-        pytest.skip("PostgreSQL is not installed: its programs are not on the PATH")
-    with postgres(programs, "mlflow") as server:
-        address = server.replace("rhmc@", f"rhmc:{CODED}@") + "/mlflow"
-        environment = os.environ | {"MLFLOW_TRACKING_URI": address, "PYTHONWARNINGS": "ignore"}
-        log = "from pipelines.tracking.mlflow_tracker import *; from pipelines.workspace.work_folder import *\n"
-        log += "MlflowTracker(StudyCard('x', 'quick', ''), Home(work_folder())).close('finished')\n"
-        words = [sys.executable, "-c", log]
-        made = subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
-        assert made.returncode == 0, made.stderr
+class Shown(NamedTuple):
+    """What was seen of the web interface, which has ended."""
+
+    password: bool  # whether the address of its store had one
+    lines: list[str]  # command lines of all processes while it ran
+    files: list[Path]  # of its project
+    port: int
+    pid: int
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory: pytest.TempPathFactory, template: Path) -> Shown:
+    """Of a store with a password if PostgreSQL is installed; started behind a proxy at which nobody answers."""
+    place, programs = tmp_path_factory.mktemp("shown"), postgres_programs()
+    environment = os.environ | {"RHMC_HOME": str(place / "work"), "PYTHONWARNINGS": "ignore"}
+    environment |= {"http_proxy": "http://127.0.0.1:9", "HTTP_PROXY": "http://127.0.0.1:9"}
+    environment.pop("MLFLOW_TRACKING_URI", None)
+    (place / "work").mkdir()
+    with ExitStack() as stack:
+        if programs is None:
+            (place / "work" / "mlflow.db").write_bytes(template.read_bytes())
+        else:
+            server = stack.enter_context(postgres(programs, "mlflow"))
+            environment["MLFLOW_TRACKING_URI"] = server.replace("rhmc@", f"rhmc:{CODED}@") + "/mlflow"
+            log = "from pipelines.tracking.mlflow_tracker import *; from pipelines.workspace.work_folder import *\n"
+            log += "MlflowTracker(StudyCard('x', 'quick', ''), Home(work_folder())).close('finished')\n"
+            words = [sys.executable, "-c", log]
+            made = subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+            assert made.returncode == 0, made.stderr
         port = free_port()
         command = [sys.executable, "-m", "pipelines.cli.main", "ui", "--port", str(port)]
         with (place / "said").open("w") as said:
@@ -221,11 +239,17 @@ def test_the_password_of_a_store_in_use_is_nowhere(place: Path) -> None:
         finally:
             process.terminate()
             process.wait(60)
-    assert sum("mlflow" in line for line in lines) >= 2  # the server and its worker were looked at
-    assert all(no_secret(line) for line in lines)
     files = [file for file in place.rglob("*") if file.is_file()]
-    assert {"ui.log", "said"} <= {file.name for file in files}
-    assert all(no_secret(file.read_bytes()) for file in files)
+    return Shown(programs is not None, lines, files, port, process.pid)
+
+
+def test_the_password_of_a_store_in_use_is_nowhere(shown: Shown) -> None:
+    if not shown.password:
+        pytest.skip("PostgreSQL is not installed: its programs are not on the PATH")
+    assert sum("mlflow" in line for line in shown.lines) >= 2  # the server and its worker were looked at
+    assert all(no_secret(line) for line in shown.lines)
+    assert {"ui.log", "said"} <= {file.name for file in shown.files}
+    assert all(no_secret(file.read_bytes()) for file in shown.files)
 
 
 def test_an_address_that_is_not_clear_says_what_to_do() -> None:
@@ -285,22 +309,10 @@ def test_a_server_of_this_machine_is_asked_past_a_proxy(
             ask("http://example.org/")
 
 
-def test_the_web_interface_comes_up_behind_a_proxy(place: Path, template: Path) -> None:
-    (place / "work").mkdir()
-    (place / "work" / "mlflow.db").write_bytes(template.read_bytes())
-    port = free_port()
-    words = [sys.executable, "-W", "ignore", "-m", "pipelines.cli.main", "ui", "--port", str(port)]
-    environment = os.environ | {"http_proxy": "http://127.0.0.1:9", "HTTP_PROXY": "http://127.0.0.1:9"}
-    with (place / "said").open("w") as said:
-        process = subprocess.Popen(words, cwd=ROOT, env=environment, stdout=said, stderr=said)
-    try:
-        wait_for(lambda: "Ctrl-C ends it" in (place / "said").read_text(), "rhmc ui")
-    finally:
-        process.terminate()
-        process.wait(60)
+def test_the_web_interface_comes_up_behind_a_proxy_and_ends_whole(shown: Shown) -> None:
     with socket.socket() as probe:
-        assert probe.connect_ex(("127.0.0.1", port)) != 0
+        assert probe.connect_ex(("127.0.0.1", shown.port)) != 0
     end = time.monotonic() + 10
-    while started_by(process.pid) and time.monotonic() < end:
+    while started_by(shown.pid) and time.monotonic() < end:
         time.sleep(0.1)
-    assert not started_by(process.pid)
+    assert not started_by(shown.pid)

@@ -5,7 +5,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import psutil
@@ -16,50 +16,21 @@ from pipelines.workspace.errors import InputError
 from pipelines.workspace.process_pool import side_by_side
 from pipelines.workspace.work_folder import StoreError
 from tests.pipelines.support import started_by
+from tests.pipelines.workspace.pooled import faulty, first_after_last, killed, shared, sleepy, told
 
 ROOT = Path(__file__).parents[3]
 SPAWNED = "spawn_main"  # in the command line of a worker
 LONG = 60.0  # seconds that no test waits
-
-
-def told(item: int) -> tuple[int, int, int]:
-    """The item, who worked on it and with how many threads."""
-    return item, os.getpid(), torch.get_num_threads()
-
-
-def first_after_last(item: tuple[int, Path]) -> tuple[int, int, int]:
-    """The same; the first item, 0, waits for the last one, 4, which leaves a file behind."""
-    number, file = item
-    while number == 0 and not file.exists():
-        time.sleep(0.01)
-    if number == 4:
-        file.touch()
-    return told(number)
-
-
-def sleepy(item: tuple[float, bytes]) -> int:
-    """Sleeps for some seconds and says how large the rest was."""
-    time.sleep(item[0])
-    return len(item[1])
-
-
-def faulty(item: Exception | int) -> int:
-    """Raises what can be raised."""
-    if isinstance(item, Exception):
-        raise item
-    return item
-
-
-def shared(tensor: torch.Tensor) -> tuple[bool, torch.Tensor]:
-    """True if the tensor came in shared memory, and the next one."""
-    return tensor.is_shared(), tensor + 1
-
-
-def killed(item: int) -> int:
-    """Dies, if it is the second."""
-    if item == 1:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return item
+MARKED = """\
+import sys
+from functools import partial
+from pipelines.cli import main
+from pipelines.export import yardsticks
+from tests.pipelines.workspace.pooled import marked
+folder, real = sys.argv.pop(), yardsticks.side_by_side
+yardsticks.side_by_side = lambda function, items, jobs: real(partial(marked, function, folder), items, jobs)
+main.main()
+"""  # the command `rhmc`, each of whose workers leaves a file in the folder of the last word when it begins to work
 
 
 def workers() -> list[psutil.Process]:
@@ -104,8 +75,9 @@ def test_a_killed_process_is_one_line() -> None:
 
 
 def test_tensors_go_without_shared_memory() -> None:
+    """And there may be more processes than items."""
     given = [torch.arange(3.0), torch.ones(2, 2)]
-    for before, (was_shared, after) in zip(given, side_by_side(shared, given, 2), strict=True):
+    for before, (was_shared, after) in zip(given, side_by_side(shared, given, 5), strict=True):
         assert not was_shared
         assert torch.equal(after, before + 1)
 
@@ -136,19 +108,34 @@ def _listening() -> Iterator[None]:
     signal.signal(signal.SIGINT, before)
 
 
+def starting(process: subprocess.Popen[bytes], marks: Path) -> bool:
+    """True if the command's workers have begun: most of this processor time goes to imports."""
+    return sum(one.cpu_times().user for one in started_by(process.pid, SPAWNED)) >= 1.0
+
+
+def at_work(process: subprocess.Popen[bytes], marks: Path) -> bool:
+    """True if both of the command's workers work on an item."""
+    return len(list(marks.iterdir())) == 2
+
+
 @pytest.mark.usefixtures("_listening")
-@pytest.mark.parametrize("at_work", [1.0, 8.0], ids=["while they start", "at work"])  # seconds of processor time
+@pytest.mark.parametrize("ready", [starting, at_work])
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL], ids=lambda how: how.name)
-def test_nothing_is_left_of_a_command_that_is_stopped(how: signal.Signals, at_work: float, tmp_path: Path) -> None:
+def test_nothing_is_left_of_a_command_that_is_stopped(
+    how: signal.Signals, ready: Callable[[subprocess.Popen[bytes], Path], bool], tmp_path: Path
+) -> None:
     """Ctrl-C reaches every process of a terminal, the other signals the one that was named."""
-    out = tmp_path / "out"
-    command = [sys.executable, "-m", "pipelines.cli.main", "yardsticks", "all", "--profile", "paper", "--out", str(out)]
+    out, marks = tmp_path / "out", tmp_path / "marks"
+    marks.mkdir()
+    words = ["yardsticks", "all", "--profile", "paper", "--jobs", "2", "--out", str(out), str(marks)]
     with (tmp_path / "said").open("w") as said:
-        process = subprocess.Popen(command, cwd=ROOT, stdout=said, stderr=said, start_new_session=True)
+        process = subprocess.Popen(
+            [sys.executable, "-c", MARKED, *words], cwd=ROOT, stdout=said, stderr=said, start_new_session=True
+        )
     try:
-        while not (found := started_by(process.pid, SPAWNED)) or sum(p.cpu_times().user for p in found) < at_work:
+        while not ready(process, marks):
             assert process.poll() is None, (tmp_path / "said").read_text()
-            time.sleep(0.02)
+            time.sleep(0.05)
         if how == signal.SIGINT:
             os.killpg(process.pid, how)
         else:

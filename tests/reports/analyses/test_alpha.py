@@ -104,7 +104,7 @@ def test_a_row_has_interval_means_and_seeds_of_both_arms(tmp_path: Path) -> None
     assert (row["seeds"], row["seeds_without"]) == (5, 3)
     assert (row["arm"], row["without"]) == ("full, horizon 18, alpha=0.5", "no regulation, alpha=0.5")
     shown = table.shown.set_index(["In", "alpha"]).loc[("horizon 18", "0.5")]
-    assert shown["Effect [95 %]"].startswith("26.5 [")
+    assert shown["Effect [95 %]"].startswith("26.5 (")
     assert shown["Seeds: with, without"] == "5; 3 of 5"
 
 

@@ -128,7 +128,7 @@ def test_claims_as_json(made: Path) -> None:
     ]
     lost = found["C13"]["ours"]["4 x 3 x 5: % lost"]
     assert lost == {"value": 4.0, "low": None, "high": None, "n": 1, "range": False}
-    assert found["C8"]["ours"]["full"]["range"] is True
+    assert found["C8a"]["ours"]["full"]["range"] is True
 
 
 def test_table_1(runs: Path, made: Path) -> None:
