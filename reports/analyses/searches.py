@@ -1,7 +1,7 @@
 """What the budget of a search bought: the best objective against the number of trials, and the winner of each arm.
 
-The objective is the final return, averaged over the seeds of a trial. Every trial of the budget counts as one, pruned and
-failed ones as well; the best is that of complete trials alone, the earliest among equals.
+The objective is the final return, averaged over the seeds of a trial. Every trial of the budget counts as one, pruned
+and failed ones as well; the best is that of complete trials alone, the earliest among equals.
 """
 
 import json
@@ -24,12 +24,13 @@ from reports.render.tables import NONE, Table, describe_task, joined, number, st
 TRIED = ("complete", "pruned", "failed")  # states of a trial that is over
 SPENT = ("complete", "pruned")
 OWN = (
-    "A trial's value is the mean final return over its seeds. Seeds and evaluation episodes are the search's own; the best "
-    "of many trials is by choice among the lucky ones: what a winner is worth, a study on other seeds and episodes says."
+    "A trial's value is the mean final return over its seeds. Seeds and evaluation episodes are the search's own. The "
+    "best of many trials was chosen for its value, which is therefore too high: a study on other seeds and episodes says "
+    "what a winner is worth."
 )
 COST = (
-    "t0 is an arm's first trial, as in the log. Steps are those of all seeds of all trials: budgets are equal in trials, "
-    "and a pruned trial trains fewer steps."
+    "t0 is an arm's first trial, as in the log. Steps are those of all seeds of all trials: budgets are equal in "
+    "trials, and a pruned trial trains fewer steps."
 )
 POINTS = ["arm", "trials", "state", "value", "best"]
 
@@ -50,14 +51,14 @@ def curve(trials: pd.DataFrame) -> pd.DataFrame:
 def winner(trials: pd.DataFrame) -> pd.Series | None:
     """The complete trial with the highest value, the earliest among equals; None without one."""
     done = trials[trials["state"] == "complete"]
-    return trials.loc[done["value"].idxmax()] if len(done) else None
+    return done.iloc[int(np.argmax(done["value"]))] if len(done) else None
 
 
-def whole(results: Results, search: str) -> str:
-    """How much of a search's budget is spent, in words; nothing if all of it is."""
+def heading(results: Results, search: str) -> str:
+    """The name of a search, and how much of its budget is spent where not all of it is."""
     states = results.trials.loc[results.trials["search"] == search, "state"]
     spent = int(states.isin(SPENT).sum())
-    return "" if spent == len(states) else f"{spent} of {len(states)} trials over"
+    return f"Search {search}" + ("" if spent == len(states) else f" ({spent} of {len(states)} trials finished)")
 
 
 def spoken(results: Results, search: str) -> str:
@@ -100,11 +101,11 @@ def fig_trials(results: Results, search: str) -> Drawing | None:
     entries = {arm: f"{arm} ({_over(trials)})" for arm, trials in tried.items()}
     entries = {arm: "\n".join(wrap(text, figures.LEGEND)) for arm, text in entries.items()}
     columns = min(5, max(1, figures.LEGEND // (max(map(len, entries.values())) + 8)))
-    rows = -(-len(entries) // columns) + sum(entry.count("\n") for entry in entries.values())
+    lines = -(-len(entries) // columns) + sum(entry.count("\n") for entry in entries.values())
     labels = [_label(arm, curves[arm], look(arm, arms)[0]) for arm in reversed(curves)]
     tall = max(figures.TALL, figures.LINE * sum(label.lines for label in labels))
     with styled():
-        height = figures.HEAD + figures.ROW * rows + tall + figures.FOOT
+        height = figures.HEAD + figures.ROW * lines + tall + figures.FOOT
         figure = blank(figures.WIDTH, height)
         axes = figure.add_axes((figures.LEFT, figures.FOOT / height, figures.SHARE, tall / height))
         for arm in reversed(curves):  # the first arm on top
@@ -116,8 +117,8 @@ def fig_trials(results: Results, search: str) -> Drawing | None:
         figures.write_legend(figure, axes, entries, columns, (height - figures.HEAD) / height)
         foot(
             figure,
-            "lines: highest mean final return of a complete trial so far; a mark: a trial that was better than all before"
-            "\npruned and failed trials count as trials; names: best of all, and in brackets above trials that are over",
+            "line: highest mean final return of a complete trial so far; mark: a trial better than all before it"
+            "\nname at the right: best of all trials; in brackets above: trials that are over, also pruned and failed",
         )
     return Drawing(figure, pd.concat([rows.assign(arm=arm) for arm, rows in curves.items()], ignore_index=True)[POINTS])
 

@@ -3,7 +3,8 @@
 A folder holds, per study, `<study>.parquet` (one row per run, step and metric), `<study>.runs.parquet` (one row per
 planned run) and, if they came along, `<study>.made.parquet` (how and where runs were made) and
 `<study>.readings.parquet` (the levels of each arm's reading); and per search `<search>.trials.parquet` (one row per
-trial of the budget). `exported` reads them. What is wrong in them is an error of one line per fault; what is not there yet is listed as missing.
+trial of the budget). `exported` reads them. What is wrong in them is an error of one line per fault; what is not there
+yet is listed as missing.
 """
 
 import json
@@ -42,7 +43,6 @@ from reports.data.exported import (
     POINTS,
     READINGS,
     RUNS,
-    SHOWN,
     TOLD,
     TRIALS,
     TRIED,
@@ -125,7 +125,7 @@ class Results:
     @property
     def set_aside(self) -> str:
         """Sentences on tables of an older version; empty without any."""
-        verbs = {name: "`rhmc study run` and `rhmc export`" for name in self.older}
+        verbs = dict.fromkeys(self.older, "`rhmc study run` and `rhmc export`")
         verbs |= {name: "`rhmc search run` and `rhmc search export`" for name in self.older if name in self.searches}
         return " ".join(
             f"Tables of {', '.join(name for name in self.older if verbs[name] == made)}: {OLDER} {made} make them anew."

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Collection, Iterator
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -23,16 +24,17 @@ def trial_faults(trials: pd.DataFrame, profile: str, studies: Collection[str]) -
         studies: names that are taken.
     """
     for search in sorted(set(trials["search"]) & set(studies)):
-        yield f"{search}.trials.parquet: a study is named {search!r} as well; rename the file of one of both"
+        yield f"{search}.trials.parquet: a study is named {search!r} as well; rename one of the two files"
     yield from first(f"{_name(row)}: {fault}" for row in trials.itertuples() for fault in _row_faults(row, profile))
     for row in trials[trials.duplicated(["search", "arm", "trial"])].itertuples():
         yield f"{_name(row)}: is there twice"
     for search, rows in trials.groupby("search"):
         budget = int(rows["trial"].max()) + 1
         for arm, mine in rows.groupby("arm"):
-            absent = sorted(set(range(budget)) - set(mine["trial"].astype(int)))
-            if absent:
-                yield f"{search}, arm {arm!r}: {len(absent)} of {budget} trials are not in the plan, the first {absent[0]}"
+            planned = set(mine["trial"].astype(int))
+            if absent := budget - len(planned):
+                lowest = next(index for index in count() if index not in planned)
+                yield f"{search!s}, arm {arm!r}: {absent} of {budget} trials have no row; the first is {lowest}"
 
 
 def _row_faults(row: Any, profile: str) -> Iterator[str]:

@@ -213,7 +213,7 @@ def _single(results: Results, paper: Paper, study: str) -> Report:
     own = _alone(results)
     if study in results.searches:
         made, title = _search_tables(results, study) | _last(own), f"Search {study}, profile {results.profile}"
-        lead = f"{_question(results, study)} {searches.told(results, study)[:1].upper()}"
+        lead = f"{_question(results, study)} {searches.spoken(results, study)}."
         return Report(results, title, lead, list(search_gallery(results, study)), made, [], results.gaps({}), [])
     made = _study_tables(results, study) | _last(own)
     title = f"Study {study}, profile {results.profile}"
@@ -430,7 +430,7 @@ def _first_seen(runs: Table) -> Iterator[tuple[str, bool]]:
 
 
 def _sections(report: Report, pictures: Path) -> list[page.Section]:
-    """The method and its tasks first, then a part per study, those of the paper first, and per search, then what belongs to none."""
+    """The method and its tasks, a part per study (those of the paper first), one per search, what belongs to none."""
     others = [name for name in report.results.studies if name not in FIRST]
     studies = [name for name in FIRST if name in report.results.studies] + others
     owners = {stem(study): study for study in studies}
@@ -525,7 +525,7 @@ def _summary(results: Results) -> str:
         arms = len(results.arms(study))
         lines.append(f"- **{markdown(study)}**: {prose(question)} ({arms} arm{'s' * (arms > 1)}, {said})")
     for search in results.searches:
-        said = f"{prose(searches.question(results, search))} ({searches.told(results, search)})"
+        said = f"{prose(searches.question(results, search))} ({searches.spoken(results, search)})"
         lines.append(f"- **{markdown(search)}**, a search: {said}")
     return "\n".join(lines) or "No study has runs yet."
 

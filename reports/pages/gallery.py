@@ -71,7 +71,8 @@ def gallery(results: Results, paper: Paper) -> list[Picture]:
         drawn += _curves(results, spec, known.get(study, f"curves_{stem(study)}"))
     own = sorted((p for p in drawn if p.name.startswith(PAPERS)), key=lambda p: _order(p.name))
     others = [p for p in drawn if not p.name.startswith(PAPERS)]
-    return [*own, *others, *comparisons(results), *(p for name in results.searches for p in search_gallery(results, name))]
+    searched = [picture for search in results.searches for picture in search_gallery(results, search)]
+    return [*own, *others, *comparisons(results), *searched]
 
 
 def in_short(results: Results, paper: Paper) -> list[str]:
@@ -106,8 +107,7 @@ def study_gallery(results: Results, paper: Paper, study: str) -> list[Picture]:
 
 def search_gallery(results: Results, search: str) -> Iterator[Picture]:
     """The figure of a search."""
-    which = f"studies/{search}.yaml --profile {results.profile}"
-    behind = f"rhmc search run {which}"
+    behind = f"rhmc search run studies/{search}.yaml --profile {results.profile}"
     title = f"Best objective by number of trials, search {search}"
     yield from picture(f"trials_{stem(search)}", title, partial(_trials, results, search), search, behind)
 
@@ -115,8 +115,8 @@ def search_gallery(results: Results, search: str) -> Iterator[Picture]:
 def _trials(results: Results, search: str) -> Made | None:
     drawing = searches.fig_trials(results, search)
     caption = (
-        "See where each line last rises: an arm that still gains at the right edge would gain from more trials, and one "
-        "that is flat for long would not. The height at a number of trials is what that budget would have found."
+        "See where each line last rises: an arm that still gains at the right edge may gain from more trials. The "
+        "height at a number of trials is what that budget would have found."
     )
     return (caption, searches.described(results, search), drawing) if drawing else None
 
