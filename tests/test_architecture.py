@@ -59,7 +59,7 @@ ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
         "policies": ("workspace", "specs", "tracking", "export"),
         "execution": ("workspace", "specs", "tracking", "policies"),
         "bundles": ("workspace", "specs", "tracking", "export", "execution"),
-        "tuning": ("workspace", "specs", "tracking", "execution"),
+        "tuning": ("workspace", "specs", "tracking", "export", "execution"),
         "cli": ("workspace", "specs", "tracking", "export", "policies", "execution", "bundles", "tuning"),
     },
     "reports": {
@@ -82,7 +82,7 @@ TABLES = tuple(
     f"pipelines/{name}.py"
     for name in (
         *(f"export/{name}" for name in ("pace", "published", "tables", "theorem", "yardsticks")),
-        *("policies/assignments", "policies/transfer"),
+        *("policies/assignments", "policies/transfer", "tuning/search_export"),
     )
 )
 # What only these files may import.

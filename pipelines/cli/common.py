@@ -3,10 +3,10 @@
 import json
 import sys
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
@@ -16,6 +16,7 @@ from pipelines.workspace.errors import InputError, visible, visible_lines
 if TYPE_CHECKING:
     from pipelines.specs.study import Study
 
+Loaded = TypeVar("Loaded")
 DONE, UNFINISHED, BAD, INTERRUPTED = 0, 1, 2, 130  # exit codes
 WIDTH = 140  # columns of a table that is not shown on a terminal
 
@@ -70,16 +71,25 @@ def load_studies(
     Raises:
         InputError: with every fault of all of them.
     """
-    studies: list[Study] = []
+    return load_each(files, lambda file: load_study(file, profile, overrides, variant))
+
+
+def load_each(files: Sequence[Path], load: Callable[[Path], Loaded]) -> list[Loaded]:
+    """What is in each of the files.
+
+    Raises:
+        InputError: with every fault of all of them.
+    """
+    found: list[Loaded] = []
     faults: dict[Path, list[str]] = {}
     for file in files:
         try:
-            studies.append(load_study(file, profile, overrides, variant))
+            found.append(load(file))
         except InputError as error:
             faults[file] = [str(line) for line in error.args]
     if faults:
         raise InputError(*_of_files(faults, len(set(files))))
-    return studies
+    return found
 
 
 def _of_files(faults: Mapping[Path, Sequence[str]], files: int) -> list[str]:

@@ -1,24 +1,28 @@
-"""`rhmc search`: check, run and follow searches."""
+"""`rhmc search`: check, run, follow and export searches."""
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipelines.cli.common import Profile, files_in, folder_option, say
+from pipelines.cli.common import BAD, DONE, Profile, files_in, folder_option, load_each, say, tell
+from pipelines.workspace.errors import InputError
 
 if TYPE_CHECKING:
     from pipelines.specs.search import Search
 
+
+def _searches(incomplete: str) -> list[str]:
+    return files_in("studies", "search_*.yaml", incomplete)
+
+
 File = Annotated[
     Path,
-    typer.Argument(
-        metavar="FILE",
-        help="A search, such as studies/search_rhmc.yaml.",
-        autocompletion=lambda incomplete: files_in("studies", "search_*.yaml", incomplete),
-    ),
+    typer.Argument(metavar="FILE", help="A search, such as studies/search_rhmc.yaml.", autocompletion=_searches),
 ]
+Files = Annotated[list[Path], typer.Argument(metavar="FILE...", help="Searches.", autocompletion=_searches)]
 Sets = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Change the search, as in a study: trials=4, base.algo.lr=1e-3."),
@@ -67,6 +71,33 @@ def status(file: File, profile: Profile = "quick", overrides: Sets = None) -> No
     from pipelines.workspace.work_folder import work_folder
 
     raise typer.Exit(show_search(search, work_folder()))
+
+
+@app.command("export")
+def export(
+    files: Files,
+    profile: Profile = "quick",
+    out: Annotated[Path | None, typer.Option(help="Folder; results/<profile>/runs if not given.")] = None,
+    overrides: Sets = None,
+) -> None:
+    """Write each search's trials as one table, for the report. Exit code 1 if a budget is not spent."""
+    searches = load_each(files, lambda file: _search(file, profile, overrides))
+    from pipelines.tracking.plan import given_twice
+    from pipelines.tuning.search_export import export_search
+    from pipelines.workspace.work_folder import work_folder
+
+    if faults := given_twice(searches):
+        raise InputError(*faults)
+    home, code = work_folder(), DONE
+    for search in searches:
+        code = max(code, export_search(search, out or Path("results") / profile / "runs", home))
+        if code == BAD:
+            raise typer.Exit(BAD)
+    words = ["rhmc", "report", *(["--study", str(files[0])] if len(files) == 1 else [])]
+    words += ["--profile", profile] if profile != "quick" else []
+    words += ["--runs", str(out)] if out else []
+    tell(f"next:  {shlex.join(words)}")
+    raise typer.Exit(code)
 
 
 def _search(file: Path, profile: str, overrides: Sequence[str] | None) -> "Search":

@@ -14,6 +14,7 @@ from ruamel.yaml.comments import CommentedSeq
 from pipelines.specs.document import choices
 from pipelines.specs.identity import combined, modules
 from pipelines.specs.safe_names import folded
+from pipelines.specs.search import Search
 from pipelines.specs.study import RunSpec, Study, changes
 from pipelines.tracking.tracker import Card, Recorded, StudyCard
 from pipelines.workspace.errors import InputError
@@ -74,19 +75,23 @@ def chosen(study: Study, arms: Sequence[str] = (), seeds: Sequence[int] = ()) ->
     return [i for i in plan if (not arms or i.card.arm in arms) and (not seeds or i.card.seed in seeds)]
 
 
-def given_twice(studies: Sequence[Study]) -> list[str]:
-    """Studies of one name, which would have one experiment and one table."""
-    named: dict[str, list[Study]] = {}
+def given_twice(studies: Sequence[Study | Search]) -> list[str]:
+    """Studies or searches of one name, which would have one experiment and one table."""
+    named: dict[str, list[Study | Search]] = {}
     for study in studies:
         named.setdefault(folded(study.name), []).append(study)
+    twice = [same for same in named.values() if len(same) > 1]
     return [
-        f"{same[0].name}: given {len(same)} times{_files(same)}; studies that go together need names of their own"
-        for same in named.values()
-        if len(same) > 1
+        f"{same[0].name}: given {len(same)} times{_files(same)}; {_kind(same)} that go together need names of their own"
+        for same in twice
     ]
 
 
-def _files(studies: Sequence[Study]) -> str:
+def _kind(studies: Sequence[Study | Search]) -> str:
+    return "studies" if isinstance(studies[0], Study) else "searches"
+
+
+def _files(studies: Sequence[Study | Search]) -> str:
     files = dict.fromkeys(study.file for study in studies)
     return f" ({', '.join(files)})" if len(files) > 1 else ""
 

@@ -37,6 +37,7 @@ from rhmc.types import Metrics
 
 ATTEMPTS = 3  # launches that try a trial which raises
 CLOSED = (TrialState.COMPLETE, TrialState.PRUNED)
+EXPORTED = {TrialState.COMPLETE: "complete", TrialState.PRUNED: "pruned", TrialState.FAIL: "failed"}  # others: partial
 OBJECTIVE = "final/return"  # what the report calls a run's final return; its mean over the seeds is maximised
 CURVE = "eval/return"  # what a trial is pruned by
 TRIAL_INDEX, ERROR = "trial_index", "error"  # attributes of a trial
@@ -63,6 +64,15 @@ class Best(NamedTuple):
     params: dict[str, Value]
     value: float
     returns: list[float]  # of each seed
+
+
+class Recorded(NamedTuple):
+    """A trial of the budget as it is exported."""
+
+    state: str  # complete, pruned, failed, partial (waiting or under way) or missing
+    value: float  # NaN unless complete
+    last: int  # number of the last point of its curve, 0 for the one at step 0
+    params: dict[str, Value]
 
 
 class ArmStudy:
@@ -210,6 +220,11 @@ class ArmStudy:
         value, trial_index, trial = max(done, key=lambda one: one[0])
         return Best(trial_index, trial.params, value, trial.user_attrs["returns"])
 
+    def recorded(self) -> list[Recorded]:
+        """Every trial of the budget, in its order, those that are missing as well."""
+        latest = self.latest()
+        return [_recorded(latest.get(trial_index)) for trial_index in range(self.search.trials)]
+
     def counts(self) -> dict[str, int]:
         """The number of trials of the budget in each state."""
         states = [trial.state for trial in self.latest().values()]
@@ -217,6 +232,14 @@ class ArmStudy:
         names |= {"waiting": TrialState.WAITING, "failed": TrialState.FAIL}
         counted = {name: states.count(state) for name, state in names.items()}
         return counted | {"missing": max(0, self.search.trials - len(states))}
+
+
+def _recorded(trial: FrozenTrial | None) -> Recorded:
+    if trial is None:
+        return Recorded("missing", math.nan, 0, {})
+    state = EXPORTED.get(trial.state, "partial")
+    value = trial.value if trial.state == TrialState.COMPLETE and trial.value is not None else math.nan
+    return Recorded(state, value, max(trial.intermediate_values, default=0), values_of(trial))
 
 
 def trial_index_of(trial: FrozenTrial) -> int | None:
@@ -234,8 +257,13 @@ def study_name(search: Search, arm: str) -> str:
     return f"{search.name} ({search.profile}) / {arm} / {search.identity(arm)}"
 
 
-def look(search: Search, arm: str, storage: BaseStorage) -> tuple[ArmStudy, int]:
-    """An arm's study for reading, empty where there is none, and how many trials have other settings or other code."""
+def look(search: Search, arm: str, storage: BaseStorage | None) -> tuple[ArmStudy, int]:
+    """An arm's study for reading, empty where there is none, and how many trials have other settings or other code.
+
+    storage: None where there is no database.
+    """
+    if storage is None:
+        return ArmStudy(search, arm, InMemoryStorage()), 0
     name, names = study_name(search, arm), optuna.get_all_study_names(storage)
     others = [n for n in names if n != name and n.rpartition(" / ")[0] == name.rpartition(" / ")[0]]
     stale = sum(len(optuna.load_study(study_name=n, storage=storage).get_trials(deepcopy=False)) for n in others)

@@ -51,8 +51,8 @@ def table(results: Results, study: str) -> Table:
             {
                 "Arm": arm,
                 "Method": names.get(kind, kind),
-                "Rows replayed per environment step": _paced(pace[arm]),
-                SETTINGS: _words(_less(own[arm], methods) | other) or NONE,
+                "Rows replayed per environment step": paced(pace[arm]),
+                SETTINGS: words(_less(own[arm], methods) | other) or NONE,
             }
         )
     unknown = sorted({names.get(kind, kind) for kind in kinds.values() if not defaults.get(kind)})
@@ -87,7 +87,7 @@ def _same(settings: Settings, name: str, value: Any) -> bool:
     return name in settings and settings[name] == value and isinstance(value, bool) == isinstance(settings[name], bool)
 
 
-def _words(settings: Settings) -> str:
+def words(settings: Settings) -> str:
     """`lr=0.001, executor.gamma=0.95`, what is long cut short."""
     return ", ".join(f"{name}={_value(settings[name])}" for name in sorted(settings))
 
@@ -105,11 +105,11 @@ def _json(value: Any) -> str:
 
 def _common_words(methods: Settings, places: Settings) -> Iterable[str]:
     if methods:
-        yield f"In all arms: {_words(methods)}."
+        yield f"In all arms: {words(methods)}."
     for section, title in (("env", "Task"), ("trainer", "Trainer")):
         mine = {name.partition(".")[2]: x for name, x in places.items() if name.startswith(f"{section}.")}
         if mine:
-            yield f"{title} of all arms: {_words(mine)}."
+            yield f"{title} of all arms: {words(mine)}."
 
 
 def _unknown_words(names: list[str]) -> Iterable[str]:
@@ -158,6 +158,6 @@ def _positive(value: Any, *, zero: bool = False) -> float:
     return found if isfinite(found) and (found > 0 or (zero and found == 0)) else nan
 
 
-def _paced(rates: Mapping[str, float]) -> str:
+def paced(rates: Mapping[str, float]) -> str:
     """`executors 2, coordinator 0.5`; the number alone where there is one level."""
     return ", ".join(f"{level} {rate:.3g}".strip() for level, rate in rates.items()) or NONE

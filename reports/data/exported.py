@@ -22,6 +22,7 @@ MADE = "made"  # `<study>.made.parquet`, which may be missing
 MOVED = "transfer"  # the table of trained policies with other numbers of agents and targets
 ASSIGNED = "assignments"  # `<study>.assignments.parquet`: what the runs of a study assigned while they trained
 READINGS = "readings"  # `<study>.readings.parquet`: the level of each factor, of every arm of a study with readings
+TRIALS = "trials"  # `<search>.trials.parquet`: the budget of every arm of a search
 FORMS: Mapping[str, pa.Schema] = {
     "points": schema.METRICS,
     "runs": schema.RUNS,
@@ -29,9 +30,10 @@ FORMS: Mapping[str, pa.Schema] = {
     ASSIGNED: schema.METRICS,
     MOVED: schema.TRANSFER,
     READINGS: schema.READINGS,
+    TRIALS: schema.TRIALS,
 }
 PLACE, POINTS, RUNS = schema.PLACE.names, schema.METRICS.names, schema.RUNS.names
-PLAYED, LEVELS = schema.TRANSFER.names, schema.READINGS.names
+PLAYED, LEVELS, TRIED = schema.TRANSFER.names, schema.READINGS.names, schema.TRIALS.names
 OWN = [name for name in schema.MADE.names if name not in PLACE]  # how and where a run was made
 TOLD = [name for name in OWN if name not in ("commit", "seconds")]
 
@@ -39,6 +41,7 @@ TYPES = {field.name: field.type for form in FORMS.values() for field in form}
 WHOLE = {name for name, kind in TYPES.items() if kind == schema.WHOLE}  # integers from 0
 NUMBERS = {name for name, kind in TYPES.items() if kind == schema.NUMBER}  # an empty cell is NaN. All others hold words
 UNKNOWN = ("fingerprint", "question", "commit", *TOLD)  # words that may not be known
+SHOWN = 5  # faults of one kind that are spelled out
 STUDY = re.compile(r"[\w-]+(@[\w-]+)?")  # a study's name, and of a variant
 
 
@@ -47,7 +50,7 @@ def part(path: Path) -> str:
     if path.name == f"{MOVED}.parquet":
         return MOVED
     second = path.name.removesuffix(".parquet").partition(".")[2]
-    return second if second in ("runs", MADE, ASSIGNED, READINGS) else "points"
+    return second if second in ("runs", MADE, ASSIGNED, READINGS, TRIALS) else "points"
 
 
 def earlier(path: Path) -> bool:
@@ -60,9 +63,9 @@ def earlier(path: Path) -> bool:
 
 
 def older(path: Path) -> bool:
-    """True if a table of runs was exported by an older version, with that version's names of studies and settings."""
+    """True if a table of runs or trials was exported by an older version, with that version's names."""
     try:
-        return part(path) == "runs" and not _of_now(_schema(path))
+        return part(path) in ("runs", TRIALS) and not _of_now(_schema(path))
     except (OSError, ValueError, pa.ArrowException):
         return False  # `read` says what is wrong with it
 
@@ -134,6 +137,14 @@ def _faults(column: pa.ChunkedArray, name: str) -> Iterator[str]:
                 yield f"column {name!r} goes down to {least}; 0 is the least"
 
 
+def first(lines: Iterator[str]) -> Iterator[str]:
+    """The first faults of a kind, and how many more."""
+    found = list(lines)
+    yield from found[:SHOWN]
+    if len(found) > SHOWN:
+        yield f"... and {len(found) - SHOWN} more of this kind"
+
+
 def _worded(kind: pa.DataType) -> bool:
     return pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_string_view(kind)
 
@@ -154,13 +165,13 @@ def _taken(column: pa.ChunkedArray, name: str) -> pa.ChunkedArray:
 
 
 def _study_faults(table: pa.Table, path: Path) -> Iterator[str]:
-    """A study's table is named as the study: what a report writes is named after it as well."""
-    own = path.name.partition(".")[0]
-    for study in sorted(set(table["study"].to_pylist())):
+    """A study's or a search's table is named as it is: what a report writes is named after it as well."""
+    own, kind = path.name.partition(".")[0], "search" if part(path) == TRIALS else "study"
+    for study in sorted(set(table[kind].to_pylist())):
         if part(path) != MOVED and study != own:
-            yield f"column 'study' says {study!r}; a table of that name is of study {own!r}"
+            yield f"column {kind!r} says {study!r}; a table of that name is of {kind} {own!r}"
         elif not STUDY.fullmatch(study):
-            yield f"column 'study' says {study!r}; a name has letters, digits, '-' and '_', and of a variant one '@'"
+            yield f"column {kind!r} says {study!r}; a name has letters, digits, '-' and '_', and of a variant one '@'"
 
 
 class Loose(BaseModel):

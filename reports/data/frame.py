@@ -2,13 +2,14 @@
 
 A folder holds, per study, `<study>.parquet` (one row per run, step and metric), `<study>.runs.parquet` (one row per
 planned run) and, if they came along, `<study>.made.parquet` (how and where runs were made) and
-`<study>.readings.parquet` (the levels of each arm's reading); `sheets` reads them. What is
-wrong in them is an error of one line per fault; what is not there yet is listed as missing.
+`<study>.readings.parquet` (the levels of each arm's reading); and per search `<search>.trials.parquet` (one row per
+trial of the budget). `exported` reads them. What is wrong in them is an error of one line per fault; what is not there
+yet is listed as missing.
 """
 
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -43,13 +44,17 @@ from reports.data.exported import (
     READINGS,
     RUNS,
     TOLD,
+    TRIALS,
+    TRIED,
     config_fault,
     earlier,
+    first,
     older,
     part,
     read,
 )
 from reports.data.stats import curve
+from reports.data.trials import trial_faults, trial_gaps
 
 __all__ = ["ASSIGNED", "MADE", "METHOD", "METHODS", "MOVED", "OWN", "PLACE", "PLAYED", "POINTS", "RUNS", "TOLD"]
 
@@ -62,8 +67,7 @@ EPISODE_ERROR = "final/return_sem"  # standard error of a final return over its 
 ERRORS = (EPISODE_ERROR, "final/coverage_sem")  # of a yardstick; one of both is there
 CHECKED = ("final/", "eval/", "theorem/", ASSIGN)  # metrics that are shown: they must be finite
 REMEDY = "`rhmc export` and `rhmc yardsticks all` write them anew, and how runs were made to *.made.parquet"
-OLDER = "made by an older version and set aside, until `rhmc study run` and `rhmc export` make them anew"
-SHOWN = 5  # faults of one kind that are spelled out
+OLDER = "made by an older version and set aside, until"
 
 # The order of arms everywhere; others follow by name.
 ORDER = (
@@ -98,9 +102,10 @@ class Results:
         modules: the networks of Figures 1 to 3, one build per encoder.
         scenes: what Figures 4, 5 and 8 show.
         moved: trained policies with other numbers of agents and targets: columns `PLAYED`.
+        trials: columns `TRIED`: the budget of every arm of the searches.
         levels: columns `LEVELS`: the level of each factor, of every arm of a study with readings.
         notes: what was left out of the tables, in sentences.
-        older: studies whose tables an older version exported.
+        older: studies and searches whose tables an older version exported.
         episodes: an animation of an episode by task, as a GIF.
     """
 
@@ -112,24 +117,39 @@ class Results:
     scenes: Scenes | None = None
     moved: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=PLAYED))
     levels: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=LEVELS))
+    trials: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=TRIED))
     notes: tuple[str, ...] = ()
     older: tuple[str, ...] = ()
     episodes: Mapping[str, bytes] = field(default_factory=dict)
 
     @property
     def set_aside(self) -> str:
-        """A sentence on tables of an older version; empty without any."""
-        return f"Tables of {', '.join(self.older)}: {OLDER}." if self.older else ""
+        """Sentences on tables of an older version; empty without any."""
+        verbs = dict.fromkeys(self.older, "`rhmc study run` and `rhmc export`")
+        verbs |= {name: "`rhmc search run` and `rhmc search export`" for name in self.older if name in self.searches}
+        return " ".join(
+            f"Tables of {', '.join(name for name in self.older if verbs[name] == made)}: {OLDER} {made} make them anew."
+            for made in dict.fromkeys(verbs.values())
+        )
 
     @property
     def studies(self) -> list[str]:
         """Names of the studies, yardsticks and theorem left out."""
         return sorted(set(self.runs["study"]) - {YARDSTICKS, THEOREM})
 
+    @property
+    def searches(self) -> list[str]:
+        """Names of the searches."""
+        return sorted(set(self.trials["search"]))
+
     def arms(self, study: str) -> list[str]:
         """Planned arms of a study in the order of `ORDER`; none if the study is not there."""
-        found = set(self.plan(study)["arm"])
-        return sorted(found, key=lambda arm: (ORDER.index(arm) if arm in ORDER else len(ORDER), arm))
+        return in_order(self.plan(study)["arm"])
+
+    def tried(self, search: str) -> dict[str, pd.DataFrame]:
+        """By arm in the order of `ORDER`, the trials of a search in that of the budget."""
+        rows = self.trials[self.trials["search"] == search].sort_values("trial", kind="stable")
+        return {arm: rows[rows["arm"] == arm].reset_index(drop=True) for arm in in_order(rows["arm"])}
 
     def has_readings(self, study: str) -> bool:
         """True if the arms of a study are trained under several readings of the paper."""
@@ -244,7 +264,7 @@ class Results:
             expected: arms that the paper has, per study.
         """
         found = [line for study in sorted({*expected, *self.studies}) for line in self._gaps(study, expected)]
-        return [*found, *self.notes]
+        return [*found, *trial_gaps(self.trials), *self.notes]
 
     def _gaps(self, study: str, expected: Mapping[str, Sequence[str]]) -> Iterator[str]:
         arms = self.arms(study)
@@ -335,13 +355,20 @@ def load(folder: Path, profile: str, only: str | None = None) -> Results:
         aside = tuple(path.name.partition(".")[0] for path in files if older(path))
         methods, modules, scenes = drawn
         about: dict[str, Any] = {"methods": methods, "levels": joined[READINGS], "notes": notes, "older": aside}
+        about["trials"] = joined[TRIALS]
         results = Results(points, runs, profile, moved=moved, **about)
         if only is None:
             results = replace(results, modules=modules, scenes=scenes, episodes=gifs)
         faults = [*_made_faults(joined[MADE]), *_plan_faults(results), *_level_faults(results), *_point_faults(results)]
+        faults += trial_faults(results.trials, profile, results.studies)
         if not faults:
             return results
     raise TableError("\n".join(faults))
+
+
+def in_order(arms: Iterable[str]) -> list[str]:
+    """Every arm once: those of `ORDER` in that order, others by name."""
+    return sorted(set(arms), key=lambda arm: (ORDER.index(arm) if arm in ORDER else len(ORDER), arm))
 
 
 def without_count(arm: str, agents: int) -> str:
@@ -414,7 +441,7 @@ def _plan_faults(results: Results) -> Iterator[str]:
         yield f"{_name(row)}: status {row.status!r} is none of {', '.join(STATUSES)}"
     for row in runs[runs["profile"] != results.profile].itertuples():
         yield f"{_name(row)}: made with profile {row.profile!r}, and this report is of {results.profile!r}"
-    yield from _first(
+    yield from first(
         f"{_name(row)}: column 'config' {fault}"
         for row in runs.itertuples()
         if (fault := config_fault(str(row.config)))
@@ -449,11 +476,11 @@ def _point_faults(results: Results) -> Iterator[str]:
     points, runs = results.points, results.runs
     keys = ["study", "arm", "seed", "run"]
     shown = points[points["metric"].astype(str).str.startswith(CHECKED)]
-    yield from _first(
+    yield from first(
         f"{_name(row)}, run {row.run}, step {row.step}: {row.metric} is {row.value}"
         for row in shown[~np.isfinite(shown["value"].astype(float))].itertuples()
     )
-    yield from _first(
+    yield from first(
         f"{_name(row)}, run {row.run}: {row.metric} at step {row.step} is there twice"
         for row in points[points.duplicated([*keys, "step", "metric"])].itertuples()
     )
@@ -466,7 +493,7 @@ def _point_faults(results: Results) -> Iterator[str]:
             yield f"{_name(row)}, run {row.run}: has points, and is not in the plan (planned arms: {arms})"
     counts = points.dropna(subset=["value"]).groupby(["run", "step", "metric"])["value"].nunique().reset_index()
     differing = counts[counts["value"] > 1].drop_duplicates("run")
-    yield from _first(
+    yield from first(
         f"run {row.run}: two values of {row.metric} at step {row.step}, so two runs share one id"
         for row in differing.itertuples()
     )
@@ -479,14 +506,6 @@ def _point_faults(results: Results) -> Iterator[str]:
             yield f"{_name(row)}, run {row.run}: marked finished, and {FINAL} is not there"
         if row.status == "missing" and (row.study, row.run) in with_points:
             yield f"{_name(row)}, run {row.run}: marked missing, and has points"
-
-
-def _first(lines: Iterator[str]) -> Iterator[str]:
-    """The first faults of a kind, and how many more."""
-    found = list(lines)
-    yield from found[:SHOWN]
-    if len(found) > SHOWN:
-        yield f"... and {len(found) - SHOWN} more of this kind"
 
 
 def _name(row: Any) -> str:

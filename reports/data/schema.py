@@ -3,7 +3,9 @@
 import pyarrow as pa
 
 WORDS, WHOLE, NUMBER = pa.string(), pa.int64(), pa.float64()
-VERSION = {"rhmc.tables": "2"}  # of the names in the tables of runs; the report sets tables of an older one aside
+VERSION = {
+    "rhmc.tables": "2"
+}  # of the names in the tables of runs and trials; the report sets tables of an older one aside
 
 PLACE = pa.schema([("study", WORDS), ("arm", WORDS), ("seed", WHOLE), ("run", WORDS)])  # run: spec id
 METRICS = pa.schema([*PLACE, ("step", WHOLE), ("metric", WORDS), ("value", NUMBER)])
@@ -41,6 +43,25 @@ READINGS = pa.schema(  # the level of each factor, of every arm of a study with 
         ("level", WORDS),
         ("number", WHOLE),  # of the level in its factor, from 0
     ]
+)
+TRIALS = pa.schema(  # the budget of a search: like runs, nothing depends on commit, machine or time
+    [
+        ("search", WORDS),
+        ("arm", WORDS),
+        ("trial", WHOLE),  # in the budget of its arm, from 0
+        ("state", WORDS),  # complete, pruned, failed, partial or missing
+        ("value", NUMBER),  # mean final return over the seeds; NaN unless complete
+        ("steps", WHOLE),  # environment steps of each seed, to the last finite point of the curve
+        ("seeds", WHOLE),  # that a trial trains
+        ("params", WORDS),  # what was tried, as canonical JSON
+        ("algorithm", WORDS),
+        ("task", WORDS),
+        ("profile", WORDS),
+        ("config", WORDS),  # the setting as canonical JSON; the file's own where nothing was tried yet
+        ("fingerprint", WORDS),  # code id
+        ("question", WORDS),
+    ],
+    metadata=VERSION,
 )
 TRANSFER = pa.schema(  # trained policies with other numbers of agents and targets
     [

@@ -12,7 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple, TypeVar
 
-from reports.analyses import alpha, beyond, comparison, readings, scaling, settings
+from reports.analyses import alpha, beyond, comparison, readings, scaling, searches, settings
 from reports.claims import verdicts as rules
 from reports.claims.verdicts import ENOUGH, SHORT, VERDICTS, Claim
 from reports.data.escaping import code, markdown, prose, stem, words
@@ -20,7 +20,7 @@ from reports.data.frame import Results, TableError, load, mixed
 from reports.data.paper import Paper, PaperError, read
 from reports.data.stats import FEW, Range
 from reports.pages import page
-from reports.pages.gallery import Picture, gallery, in_short, reason, study_gallery
+from reports.pages.gallery import Picture, gallery, in_short, reason, search_gallery, study_gallery
 from reports.render import tables
 from reports.render.canvas import save, write_csv
 from reports.render.glyphs import LOST
@@ -211,6 +211,10 @@ def _whole(results: Results, paper: Paper) -> Report:
 
 def _single(results: Results, paper: Paper, study: str) -> Report:
     own = _alone(results)
+    if study in results.searches:
+        made, title = _search_tables(results, study) | _last(own), f"Search {study}, profile {results.profile}"
+        lead = f"{_question(results, study)} {searches.spoken(results, study)}."
+        return Report(results, title, lead, list(search_gallery(results, study)), made, [], results.gaps({}), [])
     made = _study_tables(results, study) | _last(own)
     title = f"Study {study}, profile {results.profile}"
     lead = f"{_question(results, study)} {_lead(results)}"
@@ -289,6 +293,8 @@ def _tables(results: Results, paper: Paper) -> dict[str, Table]:
     made |= {"table_2": tables.table_2(results, paper)} if results.arms("ablation") else {}
     for study in results.studies:
         made |= _study_tables(results, study)
+    for search in results.searches:
+        made |= _search_tables(results, search)
     made |= {"yardsticks": tables.yardsticks(results)} if results.yardsticks else {}
     every = {
         "numbers": beyond.table_numbers(results),
@@ -324,6 +330,10 @@ def _study_tables(results: Results, study: str) -> dict[str, Table]:
         "settings": settings.table(results, study),
     }
     return {f"{name}_{stem(study)}": table for name, table in every.items() if table}
+
+
+def _search_tables(results: Results, search: str) -> dict[str, Table]:
+    return {f"winners_{stem(search)}": searches.table_winners(results, search)}
 
 
 def _save(table: Table, folder: Path, name: str) -> None:
@@ -420,7 +430,7 @@ def _first_seen(runs: Table) -> Iterator[tuple[str, bool]]:
 
 
 def _sections(report: Report, pictures: Path) -> list[page.Section]:
-    """The method and its tasks first, then a part per study, those of the paper first, then what belongs to none."""
+    """The method and its tasks, a part per study (those of the paper first), one per search, what belongs to none."""
     others = [name for name in report.results.studies if name not in FIRST]
     studies = [name for name in FIRST if name in report.results.studies] + others
     owners = {stem(study): study for study in studies}
@@ -432,7 +442,13 @@ def _sections(report: Report, pictures: Path) -> list[page.Section]:
         for study in studies
         for names in [tuple(name for name, owner in of_table.items() if owner == study)]
     ]
-    rest = tuple(name for name in report.tables if name not in of_table and name not in ("table_1", *LAST))
+    of_search = {name: tuple(_search_tables(report.results, name)) for name in report.results.searches}
+    whole += [
+        _section(report, pictures, f"search-{stem(name)}", searches.heading(report.results, name), name, names)
+        for name, names in of_search.items()
+    ]
+    elsewhere = {"table_1", *LAST, *of_table, *(name for names in of_search.values() for name in names)}
+    rest = tuple(name for name in report.tables if name not in elsewhere)
     whole.append(_section(report, pictures, "scale", "Yardsticks, transfer, encoder, Theorem 1", "-", rest))
     return [section for section in whole if section.plates or section.grids]
 
@@ -451,7 +467,7 @@ def _section(report: Report, pictures: Path, name: str, title: str, study: str, 
         episodes = [page.episode(task, gif) for task, gif in report.results.episodes.items()]
         plates |= {plate.name: plate for plate in episodes}
     grids = {key: page.grid(key, report.tables[key]) for key in names if key in report.tables}
-    words = _question(report.results, study) if study in report.results.studies else ""
+    words = _question(report.results, study) if study in (*report.results.studies, *report.results.searches) else ""
     return page.Section(name, title, words, *_parted(plates), *_parted(grids))
 
 
@@ -477,6 +493,9 @@ def _alone(results: Results) -> Results:
 
 
 def _question(results: Results, study: str) -> str:
+    """What a study or a search asks."""
+    if study in results.searches:
+        return searches.question(results, study)
     return str(results.plan(study)["question"].iloc[0])
 
 
@@ -505,6 +524,9 @@ def _summary(results: Results) -> str:
         said += f", final return over {episodes} episodes" if episodes else ""
         arms = len(results.arms(study))
         lines.append(f"- **{markdown(study)}**: {prose(question)} ({arms} arm{'s' * (arms > 1)}, {said})")
+    for search in results.searches:
+        said = f"{prose(searches.question(results, search))} ({searches.spoken(results, search)})"
+        lines.append(f"- **{markdown(search)}**, a search: {said}")
     return "\n".join(lines) or "No study has runs yet."
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import NamedTuple
 
-from reports.analyses import alpha, beyond, comparison, readings, scaling
+from reports.analyses import alpha, beyond, comparison, readings, scaling, searches
 from reports.analyses.scaling import Sweep
 from reports.data.drawn import Counterexample, Scenes
 from reports.data.escaping import stem
@@ -70,7 +70,9 @@ def gallery(results: Results, paper: Paper) -> list[Picture]:
         spec = paper.figures[known[study]] if study in known else paper.curves_of(study, results.task(study))
         drawn += _curves(results, spec, known.get(study, f"curves_{stem(study)}"))
     own = sorted((p for p in drawn if p.name.startswith(PAPERS)), key=lambda p: _order(p.name))
-    return own + [p for p in drawn if not p.name.startswith(PAPERS)] + list(comparisons(results))
+    others = [p for p in drawn if not p.name.startswith(PAPERS)]
+    searched = [picture for search in results.searches for picture in search_gallery(results, search)]
+    return [*own, *others, *comparisons(results), *searched]
 
 
 def in_short(results: Results, paper: Paper) -> list[str]:
@@ -101,6 +103,22 @@ def study_gallery(results: Results, paper: Paper, study: str) -> list[Picture]:
         *_sweep(results, study, f"scaling_{stem(study)}"),
         *comparisons(results),
     ]
+
+
+def search_gallery(results: Results, search: str) -> Iterator[Picture]:
+    """The figure of a search."""
+    behind = f"rhmc search run studies/{search}.yaml --profile {results.profile}"
+    title = f"Best objective by number of trials, search {search}"
+    yield from picture(f"trials_{stem(search)}", title, partial(_trials, results, search), search, behind)
+
+
+def _trials(results: Results, search: str) -> Made | None:
+    drawing = searches.fig_trials(results, search)
+    caption = (
+        "See where each line last rises: an arm that still gains at the right edge may gain from more trials. The "
+        "height at a number of trials is what that budget would have found."
+    )
+    return (caption, searches.described(results, search), drawing) if drawing else None
 
 
 def comparisons(results: Results) -> Iterator[Picture]:

@@ -20,7 +20,8 @@ from reports.data.paper import Curves
 from reports.render.canvas import FAINT, MARGIN, QUIET, Drawing, blank, foot, head, look, save, styled
 from reports.render.tables import describe_task, joined, number, readable, seeds, spans, steps
 
-__all__ = ["Drawing", "each_arm", "footer", "learning_curves", "save", "spread"]
+__all__ = ["Drawing", "Label", "each_arm", "footer", "learning_curves", "per", "save", "spread"]
+__all__ += ["write_labels", "write_legend"]
 
 # In inches
 WIDTH, TALL = 9.0, 3.6  # of the figure; least height of the axes
@@ -72,9 +73,9 @@ def learning_curves(results: Results, spec: Curves) -> Drawing | None:
         for arm in reversed(list(curves)):  # the first arm on top
             _draw_curve(axes, curves[arm], *look(arm, arms))
         _finish(axes, curves, results.env(spec.study).get("kind", ""))
-        _write_labels(axes, labels, LINE / tall)
+        write_labels(axes, labels, LINE / tall)
         head(figure, spec.title, describe_task(results.env(spec.study)))
-        _legend(figure, axes, dict(zip(arms, entries, strict=True)), columns, (height - HEAD) / height)
+        write_legend(figure, axes, dict(zip(arms, entries, strict=True)), columns, (height - HEAD) / height)
         foot(figure, footer(results, spec))
     return Drawing(figure, _numbers(curves, yardsticks, levels))
 
@@ -242,11 +243,15 @@ def _finish(axes: Axes, curves: Mapping[str, pd.DataFrame], task: str) -> None:
     axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: steps(x)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}".replace("-", "−")))
     axes.set_xlabel("environment steps")
-    per = "sum over an episode" if task == "navigation" else "100 × mean reward per step"
-    axes.set_ylabel(f"return ({per})")
+    axes.set_ylabel(f"return ({per(task)})")
 
 
-def _write_labels(axes: Axes, labels: Sequence[Label], line: float) -> None:
+def per(task: str) -> str:
+    """What a return of a task is, in words."""
+    return "sum over an episode" if task == "navigation" else "100 × mean reward per step"
+
+
+def write_labels(axes: Axes, labels: Sequence[Label], line: float) -> None:
     """Names to the right of the axes, each joined to its line. line: height of a line of words, in the axes'."""
     low, high = axes.get_ylim()
     heights = [(label.y - low) / (high - low) for label in labels]
@@ -259,7 +264,7 @@ def _write_labels(axes: Axes, labels: Sequence[Label], line: float) -> None:
         axes.text(1.037, place, label.text, color=label.colour, fontweight=weight, **at)
 
 
-def _legend(figure: Figure, axes: Axes, entries: Mapping[str, str], columns: int, top: float) -> None:
+def write_legend(figure: Figure, axes: Axes, entries: Mapping[str, str], columns: int, top: float) -> None:
     """Above the axes: every planned arm with its number of seeds."""
     lines = []
     for arm in entries:

@@ -85,7 +85,7 @@ def test_reading_a_study_needs_no_ray_and_no_mlflow() -> None:
 VERBS = [
     *([], ["study"], ["study", "run"], ["study", "export"], ["study", "import"], ["yardsticks"], ["evaluate"]),
     *(["yardsticks", "all"], ["transfer"], ["assignments"]),
-    *(["search"], ["search", "check"], ["search", "run"], ["search", "status"]),
+    *(["search"], ["search", "check"], ["search", "run"], ["search", "status"], ["search", "export"]),
     *(["export"], ["report"], ["ui"], ["doctor"], ["profile"]),
 ]
 

@@ -152,6 +152,11 @@ CASES = [
         ("show_search(search_x paper 3, work)",),
     ),
     Case(
+        f"search export studies/search_x.yaml {PAPER} --out o",
+        {"pipelines.tuning.search_export.export_search": 0},
+        ("export_search(search_x paper 3, o, work)",),
+    ),
+    Case(
         "yardsticks coverage --preset executor --agents 2 --targets 3 --policies random --episodes 8 --seed 9 "
         "--profile paper --json --out o",
         {"rhmc.yardsticks.scores.play_yardsticks": {"random": {}}, "pipelines.export.yardsticks.export_yardsticks": ""},

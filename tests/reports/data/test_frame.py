@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from reports.data import frame
+from reports.data.exported import SHOWN
 from reports.data.frame import RUNS, TableError, load
 from tests.reports import factory
 from tests.reports.factory import COVERAGE, NAVIGATION, Tables, study, write, yardsticks
@@ -135,8 +135,8 @@ def test_one_run_may_stand_in_two_studies_if_its_values_agree(tmp_path: Path) ->
 def test_many_faults_of_a_kind_are_counted(tmp_path: Path) -> None:
     points, runs = study("ablation", ARMS)
     lines = faults(tmp_path, (pd.concat([points, points]), runs))
-    assert len(lines) == frame.SHOWN + 1
-    assert lines[-1] == f"... and {len(points) - frame.SHOWN} more of this kind"
+    assert len(lines) == SHOWN + 1
+    assert lines[-1] == f"... and {len(points) - SHOWN} more of this kind"
 
 
 def test_files_that_are_not_there_or_not_tables(tmp_path: Path) -> None:
