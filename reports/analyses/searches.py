@@ -25,8 +25,8 @@ TRIED = ("complete", "pruned", "failed")  # states of a trial that is over
 SPENT = ("complete", "pruned")
 OWN = (
     "A trial's value is the mean final return over its seeds. Seeds and evaluation episodes are the search's own. The "
-    "best of many trials was chosen for its value, which is therefore too high: a study on other seeds and episodes says "
-    "what a winner is worth."
+    "best of many trials was chosen for its value, which is therefore too high: a study on other seeds and episodes "
+    "says what a winner is worth."
 )
 COST = (
     "t0 is an arm's first trial, as in the log. Steps are those of all seeds of all trials: budgets are equal in "
