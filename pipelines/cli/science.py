@@ -93,7 +93,7 @@ def drawings(
 
 def report(
     profile: Profile = "quick",
-    study: Annotated[Path | None, typer.Option(metavar="FILE", help="Report on this study alone.")] = None,
+    study: Annotated[Path | None, typer.Option(metavar="FILE", help="Report on this study or search alone.")] = None,
     variant: Annotated[str | None, typer.Option(help="Variant of that study.")] = None,
     runs: Annotated[Path | None, typer.Option(help="Exported tables; results/<profile>/runs if not given.")] = None,
     out: Annotated[
