@@ -51,7 +51,14 @@ def test_a_row_for_each_trial_of_the_budget(tmp_path: Path, capsys: pytest.Captu
     assert list(zip(table["arm"], table["trial"], strict=True)) == [
         (arm, n) for arm in ("IQL", "VDN") for n in range(5)
     ]
-    same = {"search": "search_x", "state": "complete", "steps": 600, "seeds": 2, "task": "navigation", "profile": "quick"}
+    same = {
+        "search": "search_x",
+        "state": "complete",
+        "steps": 600,
+        "seeds": 2,
+        "task": "navigation",
+        "profile": "quick",
+    }
     for column, value in (same | {"question": "Which?"}).items():
         assert set(table[column]) == {value}
     (iql, _) = world.arm_studies()
