@@ -901,6 +901,26 @@ def test_one_byte_of_a_file(good: Path, there: Path, tmp_path: Path, name: str, 
     settle(folder, there)
 
 
+@pytest.mark.parametrize("flip", [1, 2, 6, 16])
+def test_a_damaged_head_of_a_table_is_an_error_and_not_the_end_of_the_process(flip: int) -> None:
+    """A column's head that cannot be decoded is an exception that pyarrow does not catch: it aborts the process."""
+    schema = pa.schema([("arm", pa.string()), ("value", pa.float64())])
+    buffer = io.BytesIO()
+    pq.write_table(pa.table({"arm": ["x"] * 3, "value": [1.0, 2.0, 3.0]}, schema), buffer)
+    whole = buffer.getvalue()
+    head = len(whole) - 8 - int.from_bytes(whole[-8:-4], "little")
+    refused = 0
+    for place in range(head, len(whole) - 8):
+        spoilt = bytearray(whole)
+        spoilt[place] ^= flip
+        files = bundle_files.Files({"runs.parquet": len(spoilt)}, lambda _, content=bytes(spoilt): io.BytesIO(content))
+        try:
+            bundle_rows._table(files, "runs.parquet", schema)
+        except bundle_rows.BundleError:
+            refused += 1
+    assert refused > 50
+
+
 def seal_as_it_is(folder: Path) -> None:
     """Seal the policies anew, should the table still be one: a byte is to be found inside, not by its digest."""
     with suppress(pa.ArrowException, OSError, ValueError, KeyError, TypeError):

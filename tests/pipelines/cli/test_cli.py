@@ -119,7 +119,7 @@ def test_the_page_of_the_command_line_names_every_verb() -> None:
         ("rhmc study ", {"check", "run", "status", "list", "copy", "export", "import", "adopt"}),
         ("rhmc study run studies/al", {"studies/alpha.yaml", "studies/alpha_regulation.yaml"}),
         ("rhmc study run studies/alpha.yaml --profile q", {"quick"}),
-        ("rhmc search run studies/", {"studies/search_rhmc.yaml"}),
+        ("rhmc search run studies/search_r", {"studies/search_rhmc.yaml"}),
     ],
 )
 def test_the_shell_completes(line: str, offered: set[str]) -> None:
