@@ -20,7 +20,7 @@ from reports.data.frame import Results
 from reports.data.stats import FEW, Interval, curve, difference, interval
 from reports.render.canvas import BLUE, GREEN, MARGIN, ORANGE, QUIET, Drawing, blank, foot, head, styled
 from reports.render.figures import spread
-from reports.render.tables import Table, describe_task, estimate, number, seeds, steps
+from reports.render.tables import Table, capital, describe_task, estimate, number, seeds, steps, tick
 
 STUDY = "alpha_regulation"
 NONE = "none"  # the regulator that bounds nothing
@@ -186,7 +186,7 @@ def _finish(axes: Axes, alphas: Sequence[float]) -> None:
     axes.set_xlabel("alpha of Eq. 6")
     axes.set_ylabel("effect, points of final return")
     axes.yaxis.set_major_locator(MaxNLocator(7))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}".replace("-", "−")))
+    axes.yaxis.set_major_formatter(tick)
 
 
 def table_effects(results: Results, study: str) -> Table | None:
@@ -222,7 +222,7 @@ def described(results: Results, study: str) -> str:
         if value := measured(results, study, one):
             lines.setdefault(f"{one.part}, {one.line}", []).append(f"{number(value.value)} at {one.alpha:g}")
     words = "; ".join(f"{name} {', '.join(values)}" for name, values in lines.items())
-    return f"Two charts of effects on the final return by alpha. {words[:1].upper()}{words[1:]}."
+    return f"Two charts of effects on the final return by alpha. {capital(words)}."
 
 
 def _numbers(results: Results, study: str, found: Sequence[Effect]) -> pd.DataFrame:
@@ -320,7 +320,7 @@ def _finish_small(axes: Axes, title: str, words: str, *, last: bool) -> None:
     axes.xaxis.set_major_locator(MaxNLocator(3))
     axes.yaxis.set_major_locator(MaxNLocator(4))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: steps(x)))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}".replace("-", "−")))
+    axes.yaxis.set_major_formatter(tick)
     axes.tick_params(labelsize=7.5, labelbottom=last)
 
 
@@ -337,7 +337,7 @@ def table_mechanism(results: Results, study: str) -> Table | None:
                 for quantity, value in found.items()
                 if value
             ]
-            cells = {f"{words[:1].upper()}{words[1:]}": _fine(found[quantity]) for quantity, words in QUANTITIES}
+            cells = {capital(words): _fine(found[quantity]) for quantity, words in QUANTITIES}
             shown.append({"alpha": f"{alpha:g}", "Arm": name} | cells)
             shown[-1]["Seeds"] = str(max(value.n for value in found.values() if value))
     if not shown:

@@ -22,7 +22,7 @@ from scipy.stats import permutation_test, t
 from statsmodels.regression.linear_model import OLS, RegressionResults
 from statsmodels.tools.sm_exceptions import SingularMatrixWarning
 
-from reports.data.frame import FINAL, ORDER, Results
+from reports.data.frame import FINAL, Results, in_order
 from reports.data.stats import LEVEL, SEED, Interval, holm
 from reports.render.canvas import BLUE, FAINT, ORANGE, QUIET, Drawing, blank, foot, head, styled
 from reports.render.tables import NONE, Table, describe_task, estimate, number, percent
@@ -114,7 +114,7 @@ def contrasts(results: Results, study: str) -> list[Contrast]:
 
 def _contrasts(results: Results, study: str) -> list[Contrast]:
     table = results.levels[results.levels["study"] == study]
-    arms = sorted(set(table["contrast"]), key=lambda arm: (ORDER.index(arm) if arm in ORDER else len(ORDER), arm))
+    arms = in_order(table["contrast"])
     return [_contrast(results, table, arms[0], arm) for arm in arms[1:]]
 
 

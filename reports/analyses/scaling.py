@@ -9,7 +9,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from reports.data.frame import FINAL, ORDER, Results
+from reports.data.frame import FINAL, Results, in_order
 from reports.data.stats import Interval, interval
 from reports.render.canvas import FAINT, QUIET, Drawing, blank, foot, head, look, styled
 from reports.render.figures import spread
@@ -36,7 +36,7 @@ def sweep(results: Results, study: str = STUDY) -> Sweep | None:
     by_count = results.by_agents(study)
     if len(by_count) < 2:
         return None
-    names = sorted({method for arms in by_count.values() for method in arms}, key=_place)
+    names = in_order(method for arms in by_count.values() for method in arms)
     return Sweep(study, {name: {n: arms[name] for n, arms in by_count.items() if name in arms} for name in names})
 
 
@@ -90,10 +90,6 @@ def _cell(results: Results, found: Sweep, value: Interval | None, arm: str | Non
         return NONE
     done = seeds(results, found.study, arm)
     return estimate(value) + (f"; {done} seeds" if " of " in done else "")
-
-
-def _place(method: str) -> tuple[int, str]:
-    return (ORDER.index(method) if method in ORDER else len(ORDER), method)
 
 
 def _under(results: Results, found: Sweep) -> str:

@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.ticker import MaxNLocator
 
 from reports.analyses import settings
 from reports.data.frame import Results
 from reports.data.trials import STATES, params
 from reports.render import figures
 from reports.render.canvas import Drawing, blank, foot, head, look, styled
-from reports.render.tables import NONE, Table, describe_task, joined, number, steps
+from reports.render.tables import NONE, Table, describe_task, joined, number, steps, tick
 
 TRIED = ("complete", "pruned", "failed")  # states of a trial that is over
 SPENT = ("complete", "pruned")
@@ -144,7 +144,7 @@ def _draw(axes: Axes, rows: pd.DataFrame, colour: str, dashes: str) -> None:
 def _finish(axes: Axes, trials: int, per: str) -> None:
     axes.set_xlim(1, max(trials, 2))
     axes.xaxis.set_major_locator(MaxNLocator(10, integer=True))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}".replace("-", "−")))
+    axes.yaxis.set_major_formatter(tick)
     axes.set_xlabel("trials")
     axes.set_ylabel(f"best final return so far ({per})")
 

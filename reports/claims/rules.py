@@ -29,7 +29,7 @@ from reports.claims.evidence import (
 from reports.data.frame import THEOREM
 from reports.data.paper import Paper
 from reports.data.stats import Interval, change, difference, interval
-from reports.render.tables import joined, number, percent, steps
+from reports.render.tables import capital, joined, number, percent, steps
 
 NEAR = 5.0  # points of return within which "about 70" and "near 60" hold
 SIZE = 10.0  # percentage points within which a loss is of the stated size
@@ -84,15 +84,16 @@ def c5a(see: Evidence) -> Finding:
     """In study `long`, or `coverage` without it. reproduced: the highest points of the mean curves of MADDPG and of
     MAPPO both lie between 1 M and 2 M steps. not reproduced: else. untestable: a method has no runs, or they end
     before 2 M steps."""
-    study, peak, ours, held = see.first_of(LONG, "coverage"), see.stated("C5a")["peak"], {}, []
+    study, peak = see.first_of(LONG, "coverage"), see.stated("C5a")["peak"]
+    ours: dict[str, Interval] = {}
     for arm in ("MADDPG", "MAPPO"):
         rows = see.curves(study, arm).dropna()
         if see.budget(study) < 2e6:
             raise UntestableError(f"Runs of {steps(see.budget(study))} steps cannot show a peak near {steps(peak)}.")
         at = interval(np.asarray(rows.idxmax(), dtype=np.float64))
-        top = ours[f"{arm}: highest at step"] = at._replace(value=float(str(rows.mean(axis=1).idxmax())))
-        held.append(abs(top.value - peak) <= 5e5)
-    return _all(dict(zip(ours, held, strict=True)), "within 1 M to 2 M", ours)
+        ours[f"{arm}: highest at step"] = at._replace(value=float(str(rows.mean(axis=1).idxmax())))
+    held = {name: abs(top.value - peak) <= 5e5 for name, top in ours.items()}
+    return _all(held, "within 1 M to 2 M", ours)
 
 
 def c5b(see: Evidence) -> Finding:
@@ -384,10 +385,10 @@ def _order(see: Evidence, arm: str) -> Finding:
     """Whether the whole method is above an arm without a part: over the readings, or in the one of the ablation."""
     if found := see.readings(arm):
         verdicts: Mapping[str, Verdict] = {"holds": "reproduced", "depends on the reading": "depends on the reading"}
-        factors = deciding(found)
-        words = f"Over {_readings(found)}: {outcome(found)}."
+        came, factors = outcome(found), deciding(found)
+        words = f"Over {_readings(found)}: {came}."
         words += f" It is decided by {joined(factors)}." if factors else " No single factor decides it."
-        return Finding(verdicts.get(outcome(found), "not reproduced"), words, _over_readings(found))
+        return Finding(verdicts.get(came, "not reproduced"), words, _over_readings(found))
     full, without = see.finals("ablation", "full"), see.finals("ablation", arm)
     see.remarks.append("one reading of the text")
     (one,) = compare({"": (full, without)}).values()
@@ -470,8 +471,3 @@ def _first_step(mask: "pd.Series[bool]") -> float:
     """First step where it holds, the last step of all if it never does."""
     at = mask.index.to_numpy(np.float64)
     return float(at[mask.to_numpy(bool).argmax()] if mask.any() else at[-1])
-
-
-def capital(text: str) -> str:
-    """Text with its first letter large."""
-    return text[:1].upper() + text[1:]

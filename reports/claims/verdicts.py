@@ -7,12 +7,12 @@ from typing import NamedTuple
 import pandas as pd
 
 from reports.claims.evidence import JUDGED, READINGS, VERDICTS, Evidence, Finding, UntestableError, Verdict
-from reports.claims.rules import RULES, Rule, capital, unstated
+from reports.claims.rules import RULES, Rule, unstated
 from reports.data.escaping import markdown
 from reports.data.frame import THEOREM, YARDSTICKS, Results
 from reports.data.paper import Paper, PaperError
 from reports.data.stats import FEW, Interval
-from reports.render.tables import NONE, SPAN, Table, estimate, joined, number, percent, steps
+from reports.render.tables import NONE, SPAN, Table, capital, estimate, joined, number, percent, steps
 
 __all__ = [
     "JUDGED",

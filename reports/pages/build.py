@@ -333,7 +333,12 @@ def _study_tables(results: Results, study: str) -> dict[str, Table]:
 
 
 def _search_tables(results: Results, search: str) -> dict[str, Table]:
-    return {f"winners_{stem(search)}": searches.table_winners(results, search)}
+    return {_winners(search): searches.table_winners(results, search)}
+
+
+def _winners(search: str) -> str:
+    """The name of a search's table."""
+    return f"winners_{stem(search)}"
 
 
 def _save(table: Table, folder: Path, name: str) -> None:
@@ -442,7 +447,7 @@ def _sections(report: Report, pictures: Path) -> list[page.Section]:
         for study in studies
         for names in [tuple(name for name, owner in of_table.items() if owner == study)]
     ]
-    of_search = {name: tuple(_search_tables(report.results, name)) for name in report.results.searches}
+    of_search = {name: (_winners(name),) for name in report.results.searches}
     whole += [
         _section(report, pictures, f"search-{stem(name)}", searches.heading(report.results, name), name, names)
         for name, names in of_search.items()

@@ -18,7 +18,7 @@ from scipy.optimize import isotonic_regression
 from reports.data.frame import FINAL, Results
 from reports.data.paper import Curves
 from reports.render.canvas import FAINT, MARGIN, QUIET, Drawing, blank, foot, head, look, save, styled
-from reports.render.tables import describe_task, joined, number, readable, seeds, spans, steps
+from reports.render.tables import describe_task, joined, number, readable, seeds, spans, steps, tick
 
 __all__ = ["Drawing", "Label", "each_arm", "footer", "learning_curves", "per", "save", "spread"]
 __all__ += ["write_labels", "write_legend"]
@@ -233,7 +233,7 @@ def _name_frame(axes: Axes, arm: str, finals: NDArray[np.float64]) -> None:
     axes.set_title("\n".join(wrap(f"{arm}: {words}", 27)), fontsize=7.5, loc="left", fontweight="bold", pad=3)
     axes.xaxis.set_major_locator(MaxNLocator(3))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: steps(x)))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}".replace("-", "−")))
+    axes.yaxis.set_major_formatter(tick)
     axes.tick_params(labelsize=7)
 
 
@@ -241,7 +241,7 @@ def _finish(axes: Axes, curves: Mapping[str, pd.DataFrame], task: str) -> None:
     last = max(rows["step"].max() for rows in curves.values())
     axes.set_xlim(0, last or 1)
     axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: steps(x)))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}".replace("-", "−")))
+    axes.yaxis.set_major_formatter(tick)
     axes.set_xlabel("environment steps")
     axes.set_ylabel(f"return ({per(task)})")
 

@@ -320,6 +320,16 @@ def percent(x: float) -> str:
     return NONE if np.isnan(x) else f"{x:+.1f} %".replace("-", "−")
 
 
+def tick(x: float, place: object = None) -> str:
+    """A number at an axis, as matplotlib asks for it: `−0.5`."""
+    return f"{x:g}".replace("-", "−")
+
+
+def capital(text: str) -> str:
+    """Text with its first letter large."""
+    return text[:1].upper() + text[1:]
+
+
 def estimate(found: Interval | None, show: Callable[[float], str] = number) -> str:
     """`66.1 [64.0, 67.9]`; `66.1 (64.0 to 67.9)` if it is a range; without brackets if one seed gives neither."""
     if found is None or np.isnan(found.value):
