@@ -17,10 +17,10 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from reports.data.frame import Results
-from reports.data.stats import FEW, Interval, curve, difference, interval
+from reports.data.stats import Interval, curve, difference, interval
 from reports.render.canvas import BLUE, GREEN, MARGIN, ORANGE, QUIET, Drawing, blank, foot, head, styled
 from reports.render.figures import spread
-from reports.render.tables import Table, capital, describe_task, estimate, number, seeds, steps, tick
+from reports.render.tables import SPAN, Table, capital, describe_task, estimate, number, seeds, spans, steps, tick
 
 STUDY = "alpha_regulation"
 NONE = "none"  # the regulator that bounds nothing
@@ -125,12 +125,12 @@ def fig_effects(results: Results, study: str) -> Drawing | None:
             axes.set_title(title, fontsize=9.5, loc="left")
             _draw_effects(axes, results, study, {one: x for one, x in drawn.items() if one.part == part})
             _finish(axes, alphas)
-        few = min(value.n for value in drawn.values())
-        narrow = f" (fewer than {FEW} seeds somewhere: narrower than 95 %)" if few < FEW else ""
-        words = (
-            f"points: difference of mean final returns; bars: 95 % bootstrap interval{narrow}; hollow: some planned "
+        bars = spans(value.n for value in drawn.values())
+        foot(
+            figure,
+            f"points: difference of mean final returns; bars: {bars}\nhollow: some planned seeds are not finished; "
+            "above zero the part helps; the scales of both sides differ",
         )
-        foot(figure, f"{words}seeds are not finished\nabove zero the part helps; the scales of both sides differ")
     return Drawing(figure, _numbers(results, study, list(drawn)))
 
 
@@ -200,7 +200,7 @@ def table_effects(results: Results, study: str) -> Table | None:
             "Effect of": one.part,
             "In": one.line,
             "alpha": f"{one.alpha:g}",
-            "Effect [95 %]": estimate(measured(results, study, one)),
+            f"Effect {SPAN}": estimate(measured(results, study, one)),
             "Mean, with": number(row["mean"]),
             "Mean, without": number(row["mean_without"]),
             "Seeds: with, without": "; ".join(seeds(results, study, arm) for arm in (one.arm, one.without)),
@@ -288,9 +288,9 @@ def fig_mechanism(results: Results, study: str) -> Drawing | None:
         _name(figure, names, counts)
         foot(
             figure,
-            "means over the rows that the coordinator learned from, rewards per step, against environment steps; band: "
-            "95 % bootstrap interval, none with one seed\nassigned pairs are on one scale; so are both rewards of an "
-            "alpha",
+            "means over the rows that the coordinator learned from, rewards per step, against environment steps\nband: "
+            f"{spans(n for rows in parts for n in rows['n'])}; assigned pairs are on one scale; so are both rewards of "
+            "an alpha",
         )
     order = ["alpha", "arm", "quantity", "step", "mean", "low", "high", "n"]
     return Drawing(figure, pd.concat(parts, ignore_index=True)[order])
@@ -342,7 +342,7 @@ def table_mechanism(results: Results, study: str) -> Table | None:
             shown[-1]["Seeds"] = str(max(value.n for value in found.values() if value))
     if not shown:
         return None
-    note = "Mean over seeds [95 %] in the last tenth of the points of each run's curve, unfinished runs included."
+    note = f"Mean over seeds {SPAN} in the last tenth of the points of each run's curve, unfinished runs included."
     title = f"Assigned, earned and learned from by alpha, study {study}"
     return Table(title, pd.DataFrame(numbers), pd.DataFrame(shown), note)
 

@@ -104,7 +104,7 @@ def test_a_row_has_interval_means_and_seeds_of_both_arms(tmp_path: Path) -> None
     assert (row["seeds"], row["seeds_without"]) == (5, 3)
     assert (row["arm"], row["without"]) == ("full, horizon 18, alpha=0.5", "no regulation, alpha=0.5")
     shown = table.shown.set_index(["In", "alpha"]).loc[("horizon 18", "0.5")]
-    assert shown["Effect [95 %]"].startswith("26.5 (")
+    assert shown["Effect [95 %] or (range)"].startswith("26.5 (")
     assert shown["Seeds: with, without"] == "5; 3 of 5"
 
 
@@ -124,7 +124,7 @@ def test_what_has_no_run_is_left_out_of_the_figure_and_a_dash_in_the_table(tmp_p
     assert [face == "white" for face in faces] == [False, True, False, True]  # not all seeds at the second alpha
     assert [x.get_text() for x in drawing.figure.axes[0].get_xticklabels()] == ["0.02", "0.5"]
     shown = table.shown.set_index(["In", "alpha"])
-    assert shown.loc[("Algorithm 1", "0.5"), "Effect [95 %]"] == "–"
+    assert shown.loc[("Algorithm 1", "0.5"), "Effect [95 %] or (range)"] == "–"
     assert shown.loc[("Algorithm 1", "0.5"), "Seeds: with, without"] == "0 of 5; 2 of 5"
     assert "Algorithm" not in alpha.described(results, NAME)
 
