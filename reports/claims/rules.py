@@ -444,8 +444,9 @@ def _convergence(see: Evidence, claim: str, arm: str) -> Values:
 def _in_time(see: Evidence, claim: str, arm: str) -> Finding:
     found, limit = _convergence(see, claim, arm), see.stated(claim)[arm]
     mean = float(found.mean())
-    reason = f"It converges in {steps(mean)}, {'within' if mean <= limit else 'not within'} {steps(limit)}."
-    return Finding(_whether(mean <= limit), reason, {f"{arm}: steps": interval(found)})
+    held = mean <= limit
+    reason = f"It converges in {steps(mean)}, {'within' if held else 'not within'} {steps(limit)}."
+    return Finding(_whether(held), reason, {f"{arm}: steps": interval(found)})
 
 
 def _flat(value: float) -> Interval:
