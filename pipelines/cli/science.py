@@ -1,7 +1,10 @@
 """Verbs that describe the code: Theorem 1, the methods, the fingerprint; and the report from what was exported."""
 
+import inspect
+import sys
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
@@ -10,6 +13,13 @@ from pipelines.specs.limits import EPISODES, SEED
 from pipelines.specs.safe_names import PROFILES, fault_of_study, simple, study_name
 from pipelines.workspace.errors import InputError, visible_lines
 from pipelines.workspace.files import fault_of, regular
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+    from rhmc.types import Spec
+
+Entry = TypeVar("Entry")
 
 
 def theorem(
@@ -31,10 +41,35 @@ def theorem(
             tell(f"wrote {export_theorem(found, seed, out)}")
 
 
-def methods(out: Annotated[Path | None, typer.Option(help="Also write methods.json in this folder.")] = None) -> None:
-    """Say what every method is (Table 1), with the parameters of the networks that it builds."""
-    from pipelines.export.methods import describe, export_methods
+def _methods(incomplete: str) -> list[str]:
+    from rhmc.algorithms import ALGORITHMS
 
+    return [kind for kind in ALGORITHMS if kind.startswith(incomplete)]
+
+
+def _tasks(incomplete: str) -> list[str]:
+    from rhmc.envs import ENVS
+
+    return [kind for kind in ENVS if kind.startswith(incomplete)]
+
+
+def methods(
+    kind: Annotated[
+        str | None, typer.Argument(autocompletion=_methods, help="Show the settings of this method instead.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Also write methods.json in this folder.")] = None,
+) -> None:
+    """Say what every method is (Table 1), with the parameters of the networks that it builds; or one's settings."""
+    from pipelines.export.methods import describe, export_methods
+    from rhmc.algorithms import ALGORITHMS
+
+    if kind is not None:
+        if out is not None:
+            raise InputError("--out: belongs to the table of all methods; leave the method out")
+        method = _entry(ALGORITHMS, kind, "method")
+        say(f"{method.about.name}: {method.about.source}; {method.about.family}, {method.about.coordination}")
+        _settings(method.config)
+        return
     with folder_option(out):
         found = describe()
         rows = [
@@ -46,6 +81,48 @@ def methods(out: Annotated[Path | None, typer.Option(help="Also write methods.js
         table(["method", "source", "family", "training", "execution", "actions", *counted], rows, numbers=counted)
         if out is not None:
             tell(f"wrote {export_methods(out)}")
+
+
+def tasks(
+    kind: Annotated[str | None, typer.Argument(autocompletion=_tasks, help="Show the settings of this task.")] = None,
+) -> None:
+    """Say which tasks there are, with the sizes of their defaults; or one's settings."""
+    from rhmc.envs import ENVS
+
+    if kind is not None:
+        config = _entry(ENVS, kind, "task").config
+        say(f"{kind}: {_summary(config)}")
+        _settings(config)
+        return
+    sizes = {name: task.physics.spec(task.config()) for name, task in ENVS.items()}
+    rows = [
+        [name, _summary(ENVS[name].config), *map(str, (s.agents, s.targets, s.episode)), _actions(s)]
+        for name, s in sizes.items()
+    ]
+    table(["task", "what", "agents", "targets", "steps", "actions"], rows, numbers=["agents", "targets", "steps"])
+
+
+def _entry(entries: Mapping[str, Entry], kind: str, what: str) -> Entry:
+    from pipelines.specs.document import choices, show
+
+    if kind not in entries:
+        raise InputError(f"{show(kind)} is no {what}; {choices(kind, entries)}")
+    return entries[kind]
+
+
+def _settings(config: "type[BaseModel]") -> None:
+    from pipelines.specs.fields import described
+
+    table(["setting", "allowed", "default", "meaning"], described(config))
+
+
+def _summary(config: "type[BaseModel]") -> str:
+    """What the page of a task says it is, in its first line."""
+    return (inspect.getdoc(sys.modules[config.__module__]) or "").partition("\n")[0].rstrip(".")
+
+
+def _actions(spec: "Spec") -> str:
+    return f"{spec.actions} numbers in [-1, 1]" if spec.continuous else f"one of {spec.actions}"
 
 
 def fingerprint(file: Annotated[Path | None, typer.Argument(help="Write it there, if it differs.")] = None) -> None:

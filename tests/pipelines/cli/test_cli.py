@@ -616,6 +616,34 @@ def test_versions_are_said(rhmc: Rhmc) -> None:
     assert out.startswith(f"rhmc {version('rhmc')}, Python 3.")
 
 
+def test_methods_and_tasks_show_one_by_its_kind(rhmc: Rhmc) -> None:
+    _, text, _ = rhmc("methods", "coma")
+    assert text.startswith("COMA: Foerster et al. 2018; actor-critic, credit by a counterfactual baseline\n")
+    assert "whole number at least 1" in text
+    assert "weight of the policy's entropy" in text
+    _, text, _ = rhmc("tasks")
+    assert [line.split()[-6:] for line in text.splitlines() if " navigation " in line] == [
+        ["3", "3", "25", "one", "of", "5"]
+    ]
+    _, text, _ = rhmc("tasks", "coverage")
+    assert text.startswith("coverage: Multi-sensor multi-target coverage")
+    assert "flat, executor, coordinator" in text
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["methods", "comma"], "'comma' is no method; allowed: rhmc, qmix, vdn, iql, maddpg, coma"),
+        (["tasks", "coverag"], "'coverag' is no task; allowed: coverage, navigation; did you mean 'coverage'?"),
+        (["methods", "coma", "--out", "o"], "--out: belongs to the table of all methods; leave the method out"),
+    ],
+)
+def test_a_kind_that_there_is_not_is_one_line(rhmc: Rhmc, words: list[str], said: str) -> None:
+    code, out, err = rhmc(*words)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith(said)
+
+
 def test_fingerprint_is_printed_or_written_where_it_differs(rhmc: Rhmc) -> None:
     text = fingerprint() + "\n"
     assert rhmc("fingerprint") == (0, text, "")
