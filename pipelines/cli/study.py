@@ -3,6 +3,7 @@
 import shlex
 import sys
 from contextlib import suppress
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -243,26 +244,49 @@ def adopt_runs(
     raise typer.Exit(UNFINISHED if refused else DONE)
 
 
+class Form(StrEnum):
+    """Of exported results."""
+
+    TABLES = "tables"
+    MARL_EVAL = "marl-eval"
+
+
 def export(
     files: Files,
     profile: Profile = "quick",
     variant: Variant = None,
     out: Annotated[Path | None, typer.Option(help="Folder; results/<profile>/runs if not given.")] = None,
     overrides: Sets = None,
+    form: Annotated[
+        Form, typer.Option("--format", help="tables, for the report; or marl-eval: JSON for marl-eval and rliable.")
+    ] = Form.TABLES,
+    runs: Annotated[
+        Path | None, typer.Option(help="For marl-eval: tables that are there already; else they are exported anew.")
+    ] = None,
 ) -> None:
     """Write each study's results as one tidy table, with tables of its runs and how they were made, for the report."""
     studies = load_studies(files, profile, overrides, variant)
+    from pipelines.export.marl_eval import export_marl_eval
     from pipelines.export.tables import export_study
     from pipelines.tracking.plan import given_twice
 
     if faults := given_twice(studies):
         raise InputError(*faults)
 
+    marl_eval = form is Form.MARL_EVAL
+    if runs is not None and not marl_eval:
+        raise InputError("--runs: belongs to --format marl-eval")
+    results = Path("results") / profile
+    tables = runs or (results / "runs" if marl_eval or not out else out)
     code = DONE
     for study in studies:
-        code = max(code, export_study(study, out or Path("results") / profile / "runs"))
+        code = max(code, DONE if runs else export_study(study, tables))
         if code == BAD:
             raise typer.Exit(BAD)
+        if marl_eval:
+            code = max(code, export_marl_eval(study.name, tables, out or results / "marl_eval"))
+    if marl_eval:
+        raise typer.Exit(code)
     words = ["rhmc", "report", *(["--study", str(files[0])] if len(files) == 1 else [])]
     words += ["--profile", profile] if profile != "quick" else []
     words += ["--variant", variant] if variant and len(files) == 1 else []

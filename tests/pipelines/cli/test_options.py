@@ -100,6 +100,11 @@ CASES = [
         ("export_study(x@large paper 3, o)",),
     ),
     Case(
+        f"export studies/x.yaml {OTHER} --format marl-eval --runs r --out o",
+        {"pipelines.export.marl_eval.export_marl_eval": 0},
+        ("export_marl_eval(x@large, r, o)",),
+    ),
+    Case(
         "theorem --instances 7 --seed 3 --alpha 0.5 --out o",
         {
             "rhmc.hierarchy.theorem.shortfall_table": "found",
