@@ -81,7 +81,7 @@ WRITERS = tuple(
 TABLES = tuple(
     f"pipelines/{name}.py"
     for name in (
-        *(f"export/{name}" for name in ("pace", "published", "tables", "theorem", "yardsticks")),
+        *(f"export/{name}" for name in ("marl_eval", "pace", "published", "tables", "theorem", "yardsticks")),
         *("policies/assignments", "policies/transfer", "tuning/search_export"),
     )
 )
@@ -613,6 +613,22 @@ def test_the_lock_holds_no_cuda() -> None:
 def test_a_loose_pin_is_an_error(line: str) -> None:
     with pytest.raises(AssertionError, match="not an exact pin"):
         pins([line])
+
+
+def test_the_version_is_one_everywhere() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    cited = YAML(typ="safe", pure=True).load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert cited["version"] == project["version"]
+    assert cited["license"] == project["license"]
+    assert f"\n## {project['version']} - " in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+
+
+def test_commits_are_checked_by_what_make_check_runs() -> None:
+    config = YAML(typ="safe", pure=True).load((ROOT / ".pre-commit-config.yaml").read_text(encoding="utf-8"))
+    entries = [hook["entry"].split() for hook in config["repos"][0]["hooks"]]
+    recipe = (ROOT / "Makefile").read_text(encoding="utf-8").partition("\ncheck:")[2].partition("\n\n")[0]
+    assert [Path(words[0]).name for words in entries] == re.findall(r"@(ruff|mypy) ", recipe)
+    assert all(words[0].startswith(".venv/bin/") for words in entries)
 
 
 if __name__ == "__main__":
