@@ -30,7 +30,7 @@ unexport PYTHONPATH
 # Each of the processes that tests and studies start would compile the project again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup repro test deep check bench soak report ui lock clean
+.PHONY: help setup repro test deep check bench soak report docs ui lock clean
 
 help: ## What there is to make
 	@grep -hE '^[a-z]+:.*## ' Makefile | sed -E 's/^([a-z]+):[^#]*## /  make \1\t/' | expand -t 14
@@ -70,6 +70,10 @@ soak: $(READY) ## Kill drivers, workers and servers of studies again and again; 
 
 report: $(READY) ## The report again, from the exported runs
 	@profile=$$(rhmc profile) && rhmc report --profile "$$profile"
+
+docs: $(READY) ## The documentation as a site in build/site, which needs no network
+	@python -m sphinx -q -W --keep-going -c docs -d build/doctrees . build/site
+	@echo "Documentation: build/site/README.html"
 
 ui: $(READY) ## The runs in MLflow's web interface
 	@rhmc ui

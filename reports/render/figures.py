@@ -127,7 +127,8 @@ def spread(heights: Sequence[float], gap: float | Sequence[float], low: float, h
     Args:
         heights: where things would like to be.
         gap: how tall a thing is, or each of them.
-        low, high: the middles of the outer ones stay between them if there is room; the top gives way if there is not.
+        low: the middle of the lowest one stays above it.
+        high: the middle of the highest one stays below it if there is room; it gives way if there is not.
     """
     if not len(heights):
         return []

@@ -159,8 +159,8 @@ def reachable(cfg: Config, state: State, horizon: int) -> Tensor:
     """True where an agent can be within 0.1 of each landmark after some number of steps from 1 to `horizon`.
 
     Motion is linear in the forces: after k steps the agent is at drift + reach * f, where f is a weighted mean of its k
-    actions. Continuous actions fill the square |f_x|, |f_y| <= 1: exact, contacts aside. Discrete ones push along one
-    axis at a time and fill the diamond |f_x| + |f_y| <= 1, up to the grain of single pushes: an upper bound.
+    actions. Continuous actions fill the square `|f_x|, |f_y| <= 1`: exact, contacts aside. Discrete ones push along one
+    axis at a time and fill the diamond `|f_x| + |f_y| <= 1`, up to the grain of single pushes: an upper bound.
 
     Returns:
         (B, N, M) bool.

@@ -5,9 +5,10 @@ options[b, i, d, j] says whether agent i completes target j under its option d. 
 Only the targets assigned to an agent count for it ("the states of assigned target"), so options are masked first.
 
 Readings of the text where it is silent or slips:
+
 - Eq. 6: p_j is 1 where an agent assigned to j completes it, q_j where j is assigned and not completed; a target
   assigned to nobody counts nothing or, with `unassigned: charged`, as one that is not completed.
-- Algorithm 1, line 11: dp[i][j] = dp[i-1][k] OR mask. Line 17: the maximum goes over the options of the last agent.
+- Algorithm 1, line 11: `dp[i][j] = dp[i-1][k] OR mask`. Line 17: the maximum goes over the options of the last agent.
 - The maximum with the executed reward is the caller's: `torch.maximum(executed(...), REGULATORS[name](...))`.
 """
 
