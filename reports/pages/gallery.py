@@ -13,6 +13,7 @@ from reports.data.drawn import Counterexample, Scenes
 from reports.data.escaping import stem
 from reports.data.frame import FINAL, Results
 from reports.data.paper import Curves, Paper
+from reports.pages.embed import Embedded
 from reports.render import diagrams, figures, scenes
 from reports.render.canvas import Drawing
 from reports.render.tables import describe_task, joined, number, steps
@@ -33,6 +34,7 @@ class Picture(NamedTuple):
     study: str = ""
     behind: str = ""  # the command that made its numbers, where it is not the study's own
     fault: str = ""  # why it could not be drawn
+    shown: Embedded | None = None  # as the page has it, once it is drawn
 
     @property
     def heading(self) -> str:
