@@ -118,7 +118,7 @@ def c6a(see: Evidence) -> Finding:
     found = compare({arm: (firsts["RHMC"], theirs) for arm, theirs in firsts.items() if arm != "RHMC"})
     held = {arm: one.below for arm, one in found.items()}
     came = _all(held, "fewer steps than", {f"{arm}: steps to 90 %": interval(x) for arm, x in firsts.items()})
-    apart = {f"steps to 90 %, RHMC − {arm}": one.gap for arm, one in found.items()}
+    apart = {f"to 90 %, RHMC − {arm}": one.gap for arm, one in found.items()}
     return came._replace(headline=behind(apart, PACE, unit=STEPS))
 
 

@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 from reports.claims.headlines import PERCENT, STEPS, Headline
 from reports.claims.verdicts import Claim
-from reports.render.tables import NONE, estimate, joined, number, steps
+from reports.render.tables import NONE, estimate, joined, number, steps, tick
 
 LIMIT = 20.0  # steps from the middle to either end
-TICKS = (-10, -5, -2, -1, 0, 1, 2, 5, 10)
+TICKS = (-10, -3, -1, 0, 1, 3, 10)
 Span = tuple[float, float]  # where it begins and how long it is, in percent of the axis
 
 
@@ -96,7 +96,7 @@ def _stated(found: Headline) -> str:
     if not math.isnan(found.paper):
         return show(found.paper, found.unit) + (" %" if found.unit == PERCENT else "")
     end, sign = (found.low, ">") if math.isinf(found.high) else (found.high, "<")
-    return f"{sign} {show(end, found.unit)}"
+    return f"{sign} {show(end, found.unit) if found.unit == STEPS else tick(end)}"
 
 
 def _sentence(claim: Claim, ours: str | None) -> str:
