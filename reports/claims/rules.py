@@ -135,16 +135,19 @@ def c7a(see: Evidence) -> Finding:
     """By number of sensors, in study `scaling`. reproduced: RHMC is above every other method at each number. not
     reproduced: else. untestable: RHMC or every other method has no runs at some number."""
     pairs: dict[str, tuple[Values, Values]] = {}
+    shorter: dict[str, str] = {}
     for count, arms in _by_sensors(see).items():
         others = see.present(SCALING, (arm for method, arm in arms.items() if method != "RHMC"))
         if not others:
             raise UntestableError(f"With {count} sensors no other method of study {SCALING} has two finished seeds.")
         ours = see.finals(SCALING, arms["RHMC"])
         pairs |= {f"{arms['RHMC']} − {arm}": (ours, see.finals(SCALING, arm)) for arm in others}
+        shorter |= {f"{arms['RHMC']} − {arm}": f"{count} sensors: RHMC − {name}" for name, arm in arms.items()}
     found = compare(pairs)
     held = [one.above for one in found.values()]
     reason = f"Above another method in {sum(held)} of {len(held)} comparisons."
-    return Finding(_whether(all(held)), reason, gaps(found), ahead(gaps(found), NEAR))
+    shown = ahead({shorter[name]: gap for name, gap in gaps(found).items()}, NEAR)
+    return Finding(_whether(all(held)), reason, gaps(found), shown)
 
 
 def c7b(see: Evidence) -> Finding:

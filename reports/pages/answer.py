@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 from markupsafe import Markup
 
-from reports.claims.verdicts import JUDGED, Claim, described
-from reports.data.escaping import words
+from reports.claims.verdicts import JUDGED, Claim
+from reports.pages.forest import rows
 from reports.pages.report import Report
 
 HOLDS = "reproduced"
@@ -58,14 +58,13 @@ def questions(report: Report) -> list[Answer]:
 def _regulator(claims: Sequence[Claim]) -> Iterator[Markup]:
     """What regulation is, and what it was worth."""
     yield Markup(
-        "It pays the coordinator for the best that agents could have made of its assignment, as Algorithm 1 works it "
-        "out, where they earned less: executors that still miss then spoil no assignment."
+        "Where agents earn less than Algorithm 1 says that they could have, it pays the coordinator that reward: "
+        "executors that still miss then spoil no assignment."
     )
-    for claim in claims:
-        if claim.id in REGULATOR:
-            found = "; ".join(f"{name} {value}" for name, value in described(claim.ours))
-            line = Markup('{} <span class="quiet">{}</span> (<a href="#{}">{}</a>, paper: {})')
-            yield line.format(claim.reason, found, claim.id, claim.id, claim.paper)
+    for row in rows([claim for claim in claims if claim.id in REGULATOR]):
+        found = f" {row.what} {row.ours};" if row.what else ""
+        line = Markup('{} (<a href="#{}">{}</a>): {}.{} paper: {}.')
+        yield line.format(row.claim.label, row.claim.id, row.claim.id, row.claim.judgement, found, row.paper)
 
 
 def _sure(report: Report) -> Iterator[Markup]:
@@ -76,8 +75,9 @@ def _sure(report: Report) -> Iterator[Markup]:
         listed = ", ".join(f"{reason} ({count})" for reason, count in reasons.most_common())
         line = Markup('<a href="#definitions">Provisional</a> verdicts rest on less than they should, by claims: {}.')
         yield line.format(listed)
-    if report.results.set_aside:
-        yield Markup.escape(words(report.results.set_aside))
+    if older := report.results.older:
+        line = Markup('Made by an older version: {} {}, see <a href="#provenance">provenance</a>.')
+        yield line.format(len(older), "table" if len(older) == 1 else "tables")
     if report.open:
         line = Markup(
             '<strong>Not everything is there yet.</strong> {} {}: see <a href="#missing">what is missing</a>.'
@@ -86,9 +86,7 @@ def _sure(report: Report) -> Iterator[Markup]:
 
 
 def _run(profile: str) -> Iterator[Markup]:
-    line = Markup("<code>make repro</code> sets up, trains and reports on the profile in <code>params.yaml</code>.")
-    yield line
-    again = Markup(
-        "<code>rhmc report --profile {}</code> makes this page anew from the tables of the runs, in a minute."
-    )
-    yield again.format(profile)
+    yield Markup(
+        "<code>make repro</code> trains and reports on the profile in <code>params.yaml</code>; <code>rhmc report "
+        "--profile {}</code> makes this page anew from the tables of the runs."
+    ).format(profile)

@@ -33,6 +33,7 @@ def of(report: Report) -> Mapping[str, Any]:
         "gaps": [words(gap) for gap in report.gaps],
         "definitions": definitions(results),
         "mixed": mixed(results.runs),
+        "aside": words(results.set_aside) if report.paper else "",
         "provenance": page.provenance(results),
         "made": page.grid("provenance", report.tables["provenance"]),
         "runs": page.grid("runs", runs),

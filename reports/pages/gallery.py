@@ -90,7 +90,8 @@ def in_short(results: Results, paper: Paper) -> list[str]:
         values = [number(float(results.finals(spec.study, arm).mean())) for arm in (own, first)]
         budget = results.budget(spec.study)
         place = f"{arms.index(own) + 1} of {len(arms)} arms"
-        head = f"{spec.title.partition(':')[0]}, {steps(budget) if budget else 'unknown'} steps"
+        head = f"{spec.title.partition(':')[0]}{', ablation' * (spec.study == 'ablation')}"
+        head += f", {steps(budget) if budget else 'unknown'} steps"
         lines.append(f"{head}: {own} ends at {values[0]} ({place} by the mean), {side} {first} at {values[1]}.")
     return lines
 

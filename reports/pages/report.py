@@ -143,13 +143,10 @@ def question(results: Results, study: str) -> str:
 
 
 def _lead(results: Results) -> str:
-    """The amount of data behind the report, in a sentence or two."""
+    """The amount of data behind the report, in a sentence."""
     runs = results.runs[results.runs["study"].isin(results.studies)]
     done, budgets = int((runs["status"] == "finished").sum()), [results.budget(study) for study in results.studies]
     known = sorted({budget for budget in budgets if budget})
     span = f", {' to '.join(dict.fromkeys((steps(known[0]), steps(known[-1]))))} steps each" if known else ""
     count = len(results.studies)
-    return (
-        f"{done} of {len(runs)} planned runs finished in {count} {'study' if count == 1 else 'studies'}{span}. Every "
-        "number comes from logged runs; what is not there is missing, never zero."
-    )
+    return f"{done} of {len(runs)} planned runs finished in {count} {'study' if count == 1 else 'studies'}{span}."

@@ -4,6 +4,7 @@ import re
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
+from urllib.parse import unquote
 
 import numpy as np
 import pandas as pd
@@ -15,6 +16,7 @@ from reports.pages.build import build, write_report
 from tests.reports.factory import noisy, study, write, yardsticks
 
 pytestmark = pytest.mark.usefixtures("quick_resampling")
+LAST = ("definitions", "provenance", "runs")
 VOID = {"meta", "img", "br", "link", "hr", "input"}
 
 
@@ -55,12 +57,15 @@ def read(made: Path) -> Reader:
 
 
 def test_nothing_is_fetched(made: Path, read: Reader) -> None:
-    text = re.sub(r"data:image/(png|gif);base64,[A-Za-z0-9+/=]+", "", (made / "index.html").read_text())
+    text = re.sub(r'"data:image/[^"]+"', '""', (made / "index.html").read_text())
     assert "http://" not in text.replace("http://www.w3.org", "")
     assert "https://" not in text
     assert not re.search(r"@import|url\(|<link|<script src", text)
-    kinds = {image["src"].partition(";")[0] for image in read.of("img")}
-    assert kinds == {"data:image/png", "data:image/gif"}
+    kinds = {re.split("[;,]", image["src"])[0] for image in read.of("img")}
+    assert kinds == {f"data:image/{kind}" for kind in ("svg+xml", "webp", "gif")}
+    for image in read.of("img"):
+        drawn = unquote(image["src"].partition(",")[2]) if "svg" in image["src"][:20] else ""
+        assert not re.search(r"(href|src)=.(?!#)|@import|url\((?!#)", drawn)  # of itself it shows parts, and no files
 
 
 def test_every_link_leads_somewhere(made: Path, read: Reader) -> None:
@@ -83,11 +88,21 @@ def test_every_figure_has_words_for_those_who_do_not_see_it(made: Path, read: Re
     assert "Fig. 9" not in read.text  # no study of it
 
 
-def test_claims_come_first_with_all_that_belongs_to_them(read: Reader) -> None:
+def test_the_answer_comes_first_and_the_evidence_after_the_results(made: Path, read: Reader) -> None:
+    text = (made / "index.html").read_text()
+    places = [text.index(f'id="{name}"') for name in ("main", "forest", "study-ablation", "method", "studies")]
+    assert places == sorted(places)
     parts = [attributes["id"] for attributes in read.of("section")]
-    assert parts[0] == "claims"
-    assert parts[1] == "method"
-    assert parts[-4:] == ["missing", "definitions", "provenance", "runs"]
+    assert parts == ["study-ablation", "method", "study-reach", "scale", "claims", "missing", *LAST]
+    assert text.index(page_sentence(made)) < text.index('id="forest"')
+
+
+def page_sentence(made: Path) -> str:
+    """The bold sentence of the page in Markdown: that of the other page."""
+    return next(line.strip("*") for line in (made / "index.md").read_text().splitlines() if line.startswith("**Of "))
+
+
+def test_claims_have_all_that_belongs_to_them(read: Reader) -> None:
     assert len(list(read.of("article"))) == 23
     for words in (
         "Without the regulation mechanism the final reward falls.",
