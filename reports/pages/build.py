@@ -25,6 +25,7 @@ from reports.render.vector import svg
 
 PART = ".report-"  # begins the name of the folder in which a report is made
 DONE, UNDRAWN, BAD = 0, 1, 2  # exit codes
+RUNS = "runs"  # the folder of the tables beside the page
 MADE = ("figures", TABLES, MEASURED, "claims.md", "claims.csv", "claims.json", "index.md", "index.html")
 
 
@@ -59,6 +60,7 @@ def build(runs: Path, out: Path, profile: str, study: str | None = None) -> Buil
     """
     results, paper = load(runs, profile, study), read()
     made = whole(results, paper) if study is None else single(results, paper, study)
+    made = made._replace(tables_at=RUNS if runs.resolve() == (out / RUNS).resolve() else "")
     try:
         with _held(out), TemporaryDirectory(prefix=PART, dir=out) as folder:
             written = _write(made, Path(folder))
@@ -109,7 +111,7 @@ def write_report(
     home = Path("results") / profile
     out = out or (home / "study" / study if study else home)
     try:
-        built = build(runs or home / "runs", out, profile, study)
+        built = build(runs or home / RUNS, out, profile, study)
     except (TableError, PaperError, OutError) as error:
         print(shown(str(error)), file=sys.stderr)
         return BAD

@@ -117,7 +117,8 @@ def _section(report: Report, name: str, title: str, study: str, names: Sequence[
     made = rules.command(study, results.profile) if study in results.studies else DRAWN
     plates = {p.name: page.plate(p, p.behind or made.partition(" && ")[0]) for p in report.pictures if p.study == study}
     if name == METHOD:
-        plates |= {plate.name: plate for plate in (page.episode(task, gif) for task, gif in results.episodes.items())}
+        episodes = [page.episode(task, gif, report.tables_at) for task, gif in results.episodes.items()]
+        plates |= {plate.name: plate for plate in episodes}
     grids = {key: page.grid(key, report.tables[key]) for key in names if key in report.tables}
     return page.Section(name, title, question(results, study) if known else "", *_parted(plates), *_parted(grids))
 

@@ -4,6 +4,7 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
+from urllib.parse import quote
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
@@ -119,14 +120,15 @@ def plate(picture: Picture, behind: str) -> Plate:
     )
 
 
-def episode(task: str, gif: bytes) -> Plate:
-    """An animation from what `rhmc render` wrote, or its place. The GIF itself is linked."""
+def episode(task: str, gif: bytes, folder: str) -> Plate:
+    """An animation from what `rhmc render` wrote, or its place. folder: of the GIF, which is linked; "" if far away."""
     words = EPISODE_WORDS.get(task, "A trained policy, and others in the same episode.")
     about = (f"episode_{stem(task)}", f"An episode of {task}", words, words)
     if fault := animation_fault(gif):
         return Plate(*about, "", 0, 0, 0, 0, "rhmc render", [], fault)
     address, (width, height) = embed.animation(gif)
-    return Plate(*about, address, width, height, width, round(width * SHOWN), "rhmc render", [])
+    files = [("GIF", f"{folder}/{quote(f'episode_{task}.gif')}")] if folder else []
+    return Plate(*about, address, width, height, width, round(width * SHOWN), "rhmc render", files)
 
 
 def animation_fault(gif: bytes) -> str:

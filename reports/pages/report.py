@@ -69,6 +69,7 @@ class Report(NamedTuple):
     smoke: str = ""  # a warning that the runs are too short
     paper: Paper | None = None
     open: int = 0  # gaps in what the claims rest on
+    tables_at: str = ""  # the folder that was read, as the page links it, if it lies beside the page
 
     @property
     def own(self) -> list[str]:

@@ -11,9 +11,10 @@ import pandas as pd
 import pytest
 
 from reports.data.frame import TableError
+from reports.data.paper import read as paper
 from reports.pages import page
 from reports.pages.build import build, write_report
-from tests.reports.factory import noisy, study, write, yardsticks
+from tests.reports.factory import NAVIGATION, drawings, episode, methods, noisy, study, write, yardsticks
 
 pytestmark = pytest.mark.usefixtures("quick_resampling")
 LAST = ("definitions", "provenance", "runs")
@@ -65,7 +66,9 @@ def test_nothing_is_fetched(made: Path, read: Reader) -> None:
     assert kinds == {f"data:image/{kind}" for kind in ("svg+xml", "webp")}
     for image in read.of("img"):
         drawn = unquote(image["src"].partition(",")[2]) if "svg" in image["src"][:20] else ""
-        assert not re.search(r"(href|src)=.(?!#|data:)|@import|url\((?!#)", drawn)  # of itself it shows parts, and no files
+        assert not re.search(
+            r"(href|src)=.(?!#|data:)|@import|url\((?!#)", drawn
+        )  # of itself it shows parts, and no files
 
 
 def test_every_link_leads_somewhere(made: Path, read: Reader) -> None:
@@ -138,6 +141,35 @@ def test_a_half_finished_study_says_so(made: Path, read: Reader) -> None:
     listed = pd.read_csv(made / "tables" / "runs.csv").set_index("status")["final_return"]
     assert np.isnan(listed["missing"])
     assert np.isnan(listed["partial"])
+
+
+@pytest.mark.usefixtures("unpainted")
+def test_an_animation_leads_to_its_gif_where_that_is_beside_the_page(tmp_path: Path) -> None:
+    runs = write(episode(methods(tmp_path / "runs")), study("coverage", {"RHMC": noisy(67)}, points=3))
+    for out, linked in ((tmp_path, True), (tmp_path / "far", False)):
+        build(runs, out, "quick")
+        links = {link["href"] for link in Reader((out / "index.html").read_text()).of("a")}
+        assert ("runs/episode_coverage.gif" in links) is linked
+
+
+@pytest.mark.usefixtures("unpainted", "quick_resampling")
+def test_a_complete_report_does_not_speak_of_what_is_missing(tmp_path: Path) -> None:
+    finals = {arm: noisy(60) for arms in paper().arms.values() for arm in arms}
+    coverage, navigation = ({arm: finals[arm] for arm in paper().arms[name]} for name in ("coverage", "navigation"))
+    both = (yardsticks(), yardsticks({"nearest": -35.0}, NAVIGATION))
+    tables = (
+        study("ablation", {arm: finals[arm] for arm in paper().arms["ablation"]}, points=3),
+        study("coverage", coverage, points=3),
+        study("navigation", navigation, env=NAVIGATION, points=3),
+        study("scaling", {"RHMC": noisy(60)}, points=3),
+        (pd.concat(points for points, _ in both), pd.concat(runs for _, runs in both)),
+    )
+    build(write(drawings(episode(methods(tmp_path / "runs"))), *tables), tmp_path / "out", "quick")
+    read = Reader((tmp_path / "out" / "index.html").read_text())
+    assert "issing" not in read.text
+    assert "Not everything" not in read.text
+    assert "missing" not in {attributes.get("id") for _, attributes in read.tags}
+    assert "Nothing: every planned run is finished." in (tmp_path / "out" / "index.md").read_text()
 
 
 def test_what_made_the_runs(read: Reader) -> None:
