@@ -33,7 +33,7 @@ ALLOWED = {
     },
     "reports": {
         *("reports", "numpy", "pandas", "scipy", "matplotlib", "cycler", "pyarrow", "pydantic", "ruamel", "jinja2"),
-        *("markupsafe", "statsmodels", "tabulate"),
+        *("markupsafe", "statsmodels", "tabulate", "PIL"),
     },
 }
 # The rooms of each package, top first, and those that each imports: a room imports only rooms above it. A module that

@@ -9,6 +9,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from reports.analyses.readings import Contrast, contrasts
+from reports.claims.headlines import Headline
 from reports.data.frame import ERRORS, FINAL, YARDSTICKS, Results
 from reports.data.paper import Paper
 from reports.data.stats import LEVEL, Interval, difference, equivalence_of_pairs, holm, welch
@@ -35,11 +36,12 @@ class UntestableError(Exception):
 
 
 class Finding(NamedTuple):
-    """The result of a rule. `ours`: the quantities it looked at, by name."""
+    """The result of a rule. `ours`: the quantities it looked at, by name; `headline`: the one that decides."""
 
     verdict: Verdict
     reason: str
     ours: Mapping[str, Interval] = {}
+    headline: Headline | None = None
 
 
 class Comparison(NamedTuple):

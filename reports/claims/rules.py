@@ -26,9 +26,10 @@ from reports.claims.evidence import (
     gaps,
     near,
 )
+from reports.claims.headlines import PERCENT, STEPS, about, ahead, at_most, at_odds, behind
 from reports.data.frame import THEOREM
 from reports.data.paper import Paper
-from reports.data.stats import Interval, change, difference, interval
+from reports.data.stats import Interval, Range, change, difference, interval
 from reports.render.tables import capital, joined, number, percent, steps
 
 NEAR = 5.0  # points of return within which "about 70" and "near 60" hold
@@ -36,6 +37,9 @@ SIZE = 10.0  # percentage points within which a loss is of the stated size
 CONVERGED = 0.95  # share of the final level from which a curve does not fall again
 REACHED = 0.9  # share of its own final value that counts as reached
 LAST = 0.1  # share of the points of a curve that make its final level
+PEAK = 500_000  # steps by which a peak may miss the stated one; one step of the plot where a claim is about steps
+PACE = 50_000  # the same where steps to a first level are compared
+SPREAD = "median and range over readings"
 
 SCALING = "scaling"  # the study of numbers of sensors
 
@@ -92,8 +96,8 @@ def c5a(see: Evidence) -> Finding:
             raise UntestableError(f"Runs of {steps(see.budget(study))} steps cannot show a peak near {steps(peak)}.")
         at = interval(np.asarray(rows.idxmax(), dtype=np.float64))
         ours[f"{arm}: highest at step"] = at._replace(value=float(str(rows.mean(axis=1).idxmax())))
-    held = {name: abs(top.value - peak) <= 5e5 for name, top in ours.items()}
-    return _all(held, "within 1 M to 2 M", ours)
+    held = {name: abs(top.value - peak) <= PEAK for name, top in ours.items()}
+    return _all(held, "within 1 M to 2 M", ours)._replace(headline=about(ours, peak, PEAK, unit=STEPS))
 
 
 def c5b(see: Evidence) -> Finding:
@@ -103,7 +107,8 @@ def c5b(see: Evidence) -> Finding:
     finals = {arm: see.finals(study, arm) for arm in ("MADDPG", "MAPPO", "RHMC", "HiT-MAC", "QMIX")}
     others = ("RHMC", "HiT-MAC", "QMIX")
     found = compare({f"{a} − {b}": (finals[a], finals[b]) for a in ("MADDPG", "MAPPO") for b in others})
-    return _all({name: one.below for name, one in found.items()}, "below", gaps(found))
+    came = _all({name: one.below for name, one in found.items()}, "below", gaps(found))
+    return came._replace(headline=behind(gaps(found), NEAR))
 
 
 def c6a(see: Evidence) -> Finding:
@@ -112,7 +117,9 @@ def c6a(see: Evidence) -> Finding:
     firsts = {arm: _reached(rows, see.finals("coverage", arm)) for arm, rows in _every_curve(see).items()}
     found = compare({arm: (firsts["RHMC"], theirs) for arm, theirs in firsts.items() if arm != "RHMC"})
     held = {arm: one.below for arm, one in found.items()}
-    return _all(held, "fewer steps than", {f"{arm}: steps to 90 %": interval(x) for arm, x in firsts.items()})
+    came = _all(held, "fewer steps than", {f"{arm}: steps to 90 %": interval(x) for arm, x in firsts.items()})
+    apart = {f"to 90 %, RHMC − {arm}": one.gap for arm, one in found.items()}
+    return came._replace(headline=behind(apart, PACE, unit=STEPS))
 
 
 def c6b(see: Evidence) -> Finding:
@@ -120,34 +127,43 @@ def c6b(see: Evidence) -> Finding:
     not reproduced: not above some. untestable: methods of the paper have no runs."""
     areas = {arm: rows.mean().to_numpy(np.float64) for arm, rows in _every_curve(see).items()}
     found = compare({f"RHMC − {arm}": (areas["RHMC"], theirs) for arm, theirs in areas.items() if arm != "RHMC"})
-    return _all({name: one.above for name, one in found.items()}, "more area", gaps(found))
+    came = _all({name: one.above for name, one in found.items()}, "more area", gaps(found))
+    return came._replace(headline=ahead(gaps(found), NEAR))
 
 
 def c7a(see: Evidence) -> Finding:
     """By number of sensors, in study `scaling`. reproduced: RHMC is above every other method at each number. not
     reproduced: else. untestable: RHMC or every other method has no runs at some number."""
     pairs: dict[str, tuple[Values, Values]] = {}
+    shorter: dict[str, str] = {}
     for count, arms in _by_sensors(see).items():
         others = see.present(SCALING, (arm for method, arm in arms.items() if method != "RHMC"))
         if not others:
             raise UntestableError(f"With {count} sensors no other method of study {SCALING} has two finished seeds.")
         ours = see.finals(SCALING, arms["RHMC"])
         pairs |= {f"{arms['RHMC']} − {arm}": (ours, see.finals(SCALING, arm)) for arm in others}
+        shorter |= {f"{arms['RHMC']} − {arm}": f"{count} sensors: RHMC − {name}" for name, arm in arms.items()}
     found = compare(pairs)
     held = [one.above for one in found.values()]
     reason = f"Above another method in {sum(held)} of {len(held)} comparisons."
-    return Finding(_whether(all(held)), reason, gaps(found))
+    shown = ahead({shorter[name]: gap for name, gap in gaps(found).items()}, NEAR)
+    return Finding(_whether(all(held)), reason, gaps(found), shown)
 
 
 def c7b(see: Evidence) -> Finding:
     """By number of sensors, in study `scaling`. reproduced: wherever a sensor is added, the 95 % interval of the change
     of RHMC's mean lies above a fall of 5 points. not reproduced: else. untestable: RHMC has no runs at some number."""
     arms = {count: by_method["RHMC"] for count, by_method in _by_sensors(see).items()}
-    finals = {f"RHMC, {count} sensors": see.finals(SCALING, arm) for count, arm in arms.items()}
-    stable = all(difference(after, before).low > -NEAR for before, after in pairwise(finals.values()))
-    ours = {name: interval(x) for name, x in finals.items()}
+    finals = {count: see.finals(SCALING, arm) for count, arm in arms.items()}
+    added = {
+        f"RHMC, {after} sensors − {before}": difference(finals[after], finals[before])
+        for before, after in pairwise(finals)
+    }
+    stable = all(one.low > -NEAR for one in added.values())
+    ours = {f"RHMC, {count} sensors": interval(x) for count, x in finals.items()}
     words = "Stable." if stable else "Not shown to be stable."
-    return Finding(_whether(stable), f"{words}{_steady_without_learning(see, list(arms))}", ours)
+    reason = f"{words}{_steady_without_learning(see, list(arms))}"
+    return Finding(_whether(stable), reason, ours, ahead(added, NEAR, least=-NEAR))
 
 
 def c8a(see: Evidence) -> Finding:
@@ -195,7 +211,10 @@ def c10c(see: Evidence) -> Finding:
     found = {arm: _convergence(see, "C10c", arm) for arm in ("full", "no filter")}
     (one,) = compare({"steps, full − no filter": (found["full"], found["no filter"])}).values()
     ours = {f"{arm}: steps": interval(x) for arm, x in found.items()}
-    return Finding(_whether(one.below), f"The difference {'is' if one.below else 'is not'} clear.", ours)
+    said = see.stated("C10c")
+    apart, theirs = {"steps, full − no filter": one.gap}, said["full"] - said["no filter"]
+    reason = f"The difference {'is' if one.below else 'is not'} clear."
+    return Finding(_whether(one.below), reason, ours, behind(apart, PEAK, unit=STEPS, paper=theirs))
 
 
 def c11(see: Evidence) -> Finding:
@@ -209,9 +228,10 @@ def c11(see: Evidence) -> Finding:
         reasons.append("the three numbers are those of Table 2, where they belong to coverage and to other methods")
     if any(x > 0 for x in numbers.values()):
         reasons.append("a sum of negative distances cannot be positive")
+    shown = at_odds("RHMC", ours["RHMC"], numbers["RHMC"], NEAR) if {"RHMC"} <= ours.keys() & numbers else None
     if reasons:
-        return Finding("contradicted by the paper itself", f"{capital('; '.join(reasons))}.", ours)
-    return Finding("untestable", "Nothing in the text speaks against it.", ours)
+        return Finding("contradicted by the paper itself", f"{capital('; '.join(reasons))}.", ours, shown)
+    return Finding("untestable", "Nothing in the text speaks against it.", ours, shown)
 
 
 def c12(see: Evidence) -> Finding:
@@ -226,9 +246,11 @@ def c12(see: Evidence) -> Finding:
         side = "above" if bound.high < numbers["RHMC"] else "not above"
         reason = f"{numbers['RHMC']:g} is {side} the {number(bound.value)} that free headings at every step would give"
     ours = {"bound with free headings": bound} if bound else {}
+    theirs = numbers["RHMC"]
+    shown = at_odds("bound with free headings", bound, theirs, NEAR, least=theirs) if bound else None
     if apart:
-        return Finding("contradicted by the paper itself", f"The paper has {joined(apart)}; {reason}.", ours)
-    return Finding("untestable", f"{capital(reason)}.", ours)
+        return Finding("contradicted by the paper itself", f"The paper has {joined(apart)}; {reason}.", ours, shown)
+    return Finding("untestable", f"{capital(reason)}.", ours, shown)
 
 
 def c13(see: Evidence) -> Finding:
@@ -240,14 +262,16 @@ def c13(see: Evidence) -> Finding:
         raise UntestableError("No instances of Algorithm 1 against the optimum were exported.")
     sizes = table.groupby(table.index.str.split(",").str[0])[["instances", "lost"]].sum()
     ours = {f"{size}: % lost": _flat(100 * row["lost"] / row["instances"]) for size, row in sizes.iterrows()}
+    most = max(ours, key=lambda size: ours[size].value)
+    shown = at_most(most, ours[most], 0.0, SIZE, unit=PERCENT)
     if not table["lost"].any():
-        return Finding("reproduced", f"No loss in {table['instances'].sum():,.0f} instances.", ours)
+        return Finding("reproduced", f"No loss in {table['instances'].sum():,.0f} instances.", ours, shown)
     share = 100 * table["lost"] / table["instances"]
     reason = (
         f"Below the optimum in {share.min():.1f} % to {share.max():.1f} % of random instances, by size and density, "
         f"and by up to {table['max_gap'].max():.2f} of reward."
     )
-    return Finding("not reproduced", reason, ours)
+    return Finding("not reproduced", reason, ours, shown)
 
 
 # What the rules take from `paper.yaml`: numbers of claims, and arms of studies.
@@ -325,18 +349,20 @@ def _best(see: Evidence, study: str) -> Finding:
     """Whether RHMC is above every other method of a study."""
     ours, (others, absent) = see.finals(study, "RHMC"), see.rivals(study)
     found = compare({f"RHMC − {arm}": (ours, see.finals(study, arm)) for arm in others})
-    behind = [arm for arm, one in zip(others, found.values(), strict=True) if not one.above]
-    if behind:
-        return Finding("not reproduced", f"It is not above {joined(behind)}.", gaps(found))
+    failed = [arm for arm, one in zip(others, found.values(), strict=True) if not one.above]
+    looked = gaps(found), ahead(gaps(found), NEAR)
+    if failed:
+        return Finding("not reproduced", f"It is not above {joined(failed)}.", *looked)
     if absent:
-        return Finding("untestable", f"It is above {joined(others)}; no results of {joined(absent)}.", gaps(found))
-    return Finding("reproduced", f"It is above {joined(others)}.", gaps(found))
+        return Finding("untestable", f"It is above {joined(others)}; no results of {joined(absent)}.", *looked)
+    return Finding("reproduced", f"It is above {joined(others)}.", *looked)
 
 
 def _below(see: Evidence, study: str, arm: str, other: str) -> Finding:
     (one,) = compare({"": (see.finals(study, arm), see.finals(study, other))}).values()
     reason = f"{arm} is {'' if one.below else 'not '}below {other}."
-    return Finding(_whether(one.below), reason, {f"{arm} − {other}": one.gap})
+    ours = {f"{arm} − {other}": one.gap}
+    return Finding(_whether(one.below), reason, ours, behind(ours, NEAR))
 
 
 def _near(see: Evidence, arm: str, level: float) -> Finding:
@@ -350,6 +376,7 @@ def _near(see: Evidence, arm: str, level: float) -> Finding:
         _whether(holds),
         words + (f" Policies that do not learn and end within {NEAR:g} points of it: {listed}." if rules else ""),
         {arm: ours},
+        about({arm: ours}, level, NEAR),
     )
 
 
@@ -383,18 +410,31 @@ def _steady_without_learning(see: Evidence, counts: Sequence[int]) -> str:
 
 def _order(see: Evidence, arm: str) -> Finding:
     """Whether the whole method is above an arm without a part: over the readings, or in the one of the ablation."""
+    name, theirs = f"full − {arm}", _table_2_gap(see, arm)
     if found := see.readings(arm):
         verdicts: Mapping[str, Verdict] = {"holds": "reproduced", "depends on the reading": "depends on the reading"}
         came, factors = outcome(found), deciding(found)
         words = f"Over {_readings(found)}: {came}."
         words += f" It is decided by {joined(factors)}." if factors else " No single factor decides it."
-        return Finding(verdicts.get(came, "not reproduced"), words, _over_readings(found))
+        shown = ahead({f"{name}, {SPREAD}": _spread(found.effects)}, NEAR, paper=theirs)
+        return Finding(verdicts.get(came, "not reproduced"), words, _over_readings(found), shown)
     full, without = see.finals("ablation", "full"), see.finals("ablation", arm)
     see.remarks.append("one reading of the text")
     (one,) = compare({"": (full, without)}).values()
     reason = f"The full method is {'' if one.above else 'not clearly '}above."
-    ours = {"full": interval(full), arm: interval(without), f"full − {arm}": one.gap}
-    return Finding(_whether(one.above), reason, ours)
+    ours = {"full": interval(full), arm: interval(without), name: one.gap}
+    return Finding(_whether(one.above), reason, ours, ahead({name: one.gap}, NEAR, paper=theirs))
+
+
+def _table_2_gap(see: Evidence, arm: str) -> float:
+    """The paper's final return of the full method less that of an arm; NaN where Table 2 lacks one of both."""
+    theirs = {row.arm: row.final for row in see.paper.table_2.rows}
+    return theirs.get("full", np.nan) - theirs.get(arm, np.nan)
+
+
+def _spread(values: Values) -> Range:
+    """The median over readings, and the range from the least to the greatest. values: (R,)."""
+    return Range(float(np.median(values)), float(values.min()), float(values.max()), len(values))
 
 
 def _over_readings(found: Contrast) -> dict[str, Interval]:
@@ -417,13 +457,15 @@ def _size(see: Evidence, claim: str, arm: str) -> Finding:
         verdict: Verdict = "depends on the reading" if SOME < share < MOST else _whether(share >= MOST)
         reason = f"Of that size in {percent_of(share)} of {_readings(found)}; {paper}."
         ours = {"median change in %": _flat(float(np.median(lost))), "largest loss in %": _flat(float(lost.min()))}
-        return Finding(verdict, reason, ours)
+        shown = about({f"change without it, {SPREAD}": _spread(lost)}, theirs, SIZE, unit=PERCENT, sign=-1)
+        return Finding(verdict, reason, ours, shown)
     full, without = see.finals("ablation", "full"), see.finals("ablation", arm)
     see.remarks.append("one reading of the text")
     loss = change(without, full)
     alike = loss.low >= theirs - SIZE and loss.high <= theirs + SIZE
     reason = f"{percent(loss.value)} is {'' if alike else 'not shown to be '}of that size; {paper}."
-    return Finding(_whether(alike), reason, {"change in %": loss})
+    shown = about({"change without it": loss}, theirs, SIZE, unit=PERCENT, sign=-1)
+    return Finding(_whether(alike), reason, {"change in %": loss}, shown)
 
 
 def _readings(found: Contrast) -> str:
@@ -446,7 +488,9 @@ def _in_time(see: Evidence, claim: str, arm: str) -> Finding:
     mean = float(found.mean())
     held = mean <= limit
     reason = f"It converges in {steps(mean)}, {'within' if held else 'not within'} {steps(limit)}."
-    return Finding(_whether(held), reason, {f"{arm}: steps": interval(found)})
+    ours = {f"{arm}: steps": interval(found)}
+    shown = at_most(f"{arm}: converged at step", interval(found), limit, PEAK, unit=STEPS)
+    return Finding(_whether(held), reason, ours, shown)
 
 
 def _flat(value: float) -> Interval:

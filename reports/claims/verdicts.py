@@ -4,14 +4,16 @@ from collections.abc import Callable, Mapping, Sequence
 from inspect import cleandoc
 from typing import NamedTuple
 
+import numpy as np
 import pandas as pd
 
 from reports.claims.evidence import JUDGED, READINGS, VERDICTS, Evidence, Finding, UntestableError, Verdict
+from reports.claims.headlines import Headline
 from reports.claims.rules import RULES, Rule, unstated
 from reports.data.escaping import markdown
 from reports.data.frame import THEOREM, YARDSTICKS, Results
 from reports.data.paper import Paper, PaperError
-from reports.data.stats import FEW, Interval
+from reports.data.stats import FEW, LEVEL, Interval, Range
 from reports.render.tables import NONE, SPAN, Table, capital, estimate, joined, number, percent, steps
 
 __all__ = [
@@ -35,7 +37,8 @@ SHORT, ENOUGH = 0.02, 0.2
 class Claim(NamedTuple):
     """A claim with its verdict.
 
-    `caveats`: why a verdict is provisional; `runs`: the ids behind it; `commands`: what makes the numbers again.
+    `label`: the claim in a few words; `caveats`: why a verdict is provisional; `runs`: the ids behind it; `commands`:
+    what makes the numbers again; `headline`: the quantity that decides, None where the rule had nothing to look at.
     """
 
     id: str
@@ -49,6 +52,8 @@ class Claim(NamedTuple):
     runs: tuple[str, ...]
     rule: str
     commands: tuple[str, ...] = ()
+    headline: Headline | None = None
+    label: str = ""
 
     @property
     def provisional(self) -> bool:
@@ -110,6 +115,7 @@ def table(claims: Sequence[Claim]) -> Table:
             "runs": " ".join(claim.runs),
             "commands": "; ".join(claim.commands),
         }
+        | _deciding(claim.headline)
         for claim in claims
     )
     shown = pd.DataFrame(
@@ -127,6 +133,27 @@ def table(claims: Sequence[Claim]) -> Table:
         for claim in claims
     )
     return Table("The paper's claims", numbers, shown, marked=True)
+
+
+def _deciding(found: Headline | None) -> dict[str, object]:
+    """The columns of a table for the quantity that decides a claim. `level`: of its interval, NaN beside a range."""
+    if found is None:
+        return {}
+    ours = found.ours
+    level = np.nan if isinstance(ours, Range) or np.isnan(ours.low) else LEVEL
+    return {
+        "quantity": found.what,
+        "unit": found.unit,
+        "value": ours.value,
+        "value_low": ours.low,
+        "value_high": ours.high,
+        "level": level,
+        "paper_value": found.paper,
+        "holds_from": found.low,
+        "holds_to": found.high,
+        "origin": found.origin,
+        "pace": found.pace,
+    }
 
 
 def describe(ours: Mapping[str, Interval]) -> str:
@@ -163,7 +190,8 @@ def _judge(name: str, rule: Rule, results: Results, paper: Paper) -> Claim:
     text = " ".join(cleandoc(rule.__doc__ or "").split())
     caveats = tuple(_caveats(see)) if found.verdict in JUDGED else ()
     about = (name, said.text, said.value, said.place, found.verdict, found.reason, found.ours, caveats, behind, text)
-    return Claim(*about, tuple(command(study, results.profile) for study in sorted(see.asked)))
+    commands = tuple(command(study, results.profile) for study in sorted(see.asked))
+    return Claim(*about, commands, found.headline, said.label or said.text)
 
 
 def _if_long_enough(found: Finding, see: Evidence) -> Finding:

@@ -32,6 +32,22 @@ class Part(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
+class Source(Part):
+    """The paper itself; what the text at hand does not state stays empty. `doi`: `10....`, no address."""
+
+    title: str
+    authors: tuple[str, ...] = ()
+    venue: str = ""
+    year: Count | None = None
+    doi: Annotated[str, Field(pattern=r"^(10\.\S+)?$")] = ""
+
+    @property
+    def about(self) -> str:
+        """Authors, venue and year, as far as they are there: `A. One, B. Two. Journal, 2024`."""
+        where = ", ".join(filter(None, (self.venue, str(self.year or ""))))
+        return ". ".join(filter(None, (", ".join(self.authors), where)))
+
+
 class Row(Part):
     """A row of Table 2. `stated`: the loss in percent as printed."""
 
@@ -59,9 +75,10 @@ class Curves(Part):
 
 
 class Statement(Part):
-    """A claim as the paper makes it."""
+    """A claim as the paper makes it. `label`: in a few words, for a row of a figure."""
 
     text: str
+    label: str = ""
     value: Text
     place: str
     numbers: dict[str, Number] = {}
@@ -70,12 +87,18 @@ class Statement(Part):
 class Paper(Part):
     """Everything the paper states that is compared. `yardsticks`: those in the figures of other studies, by task."""
 
+    source: Source
     table_2: Ablation
     figures: dict[str, Curves]
     arms: dict[str, tuple[str, ...]]
     steps: dict[str, Count]
     claims: dict[str, Statement]
     yardsticks: dict[str, tuple[str, ...]]
+
+    @property
+    def studies(self) -> frozenset[str]:
+        """The studies that the paper has: of a figure, of its arms, or with a budget of its text."""
+        return frozenset({*(figure.study for figure in self.figures.values()), *self.arms, *self.steps})
 
     def curves_of(self, study: str, task: str) -> Curves:
         """Curves of a study that the paper does not have."""

@@ -13,6 +13,7 @@ from reports.data.drawn import Counterexample, Scenes
 from reports.data.escaping import stem
 from reports.data.frame import FINAL, Results
 from reports.data.paper import Curves, Paper
+from reports.pages.embed import Embedded
 from reports.render import diagrams, figures, scenes
 from reports.render.canvas import Drawing
 from reports.render.tables import describe_task, joined, number, steps
@@ -33,6 +34,7 @@ class Picture(NamedTuple):
     study: str = ""
     behind: str = ""  # the command that made its numbers, where it is not the study's own
     fault: str = ""  # why it could not be drawn
+    shown: Embedded | None = None  # as the page has it, once it is drawn
 
     @property
     def heading(self) -> str:
@@ -88,7 +90,8 @@ def in_short(results: Results, paper: Paper) -> list[str]:
         values = [number(float(results.finals(spec.study, arm).mean())) for arm in (own, first)]
         budget = results.budget(spec.study)
         place = f"{arms.index(own) + 1} of {len(arms)} arms"
-        head = f"{spec.title.partition(':')[0]}, {steps(budget) if budget else 'unknown'} steps"
+        head = f"{spec.title.partition(':')[0]}{', ablation' * (spec.study == 'ablation')}"
+        head += f", {steps(budget) if budget else 'unknown'} steps"
         lines.append(f"{head}: {own} ends at {values[0]} ({place} by the mean), {side} {first} at {values[1]}.")
     return lines
 

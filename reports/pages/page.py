@@ -1,23 +1,26 @@
 """The report as one page of HTML that needs nothing else: figures inside, no network, the same bytes every time."""
 
 import re
-from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
+from urllib.parse import quote
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from reports.claims.verdicts import JUDGED, VERDICTS, Claim, described
+from reports.claims.verdicts import VERDICTS, Claim, described
 from reports.data.escaping import stem
 from reports.data.frame import TOLD, Results, adopted
+from reports.pages import embed
 from reports.pages.gallery import Picture
 from reports.render.tables import NONE, Table
 
 TEMPLATE = "page.html.j2"
 NUMBER = re.compile(r"^[+<\s]*(-?\d[\d,]*(?:\.\d+)?)\s*([kM]?)\b")
 SHOWN = 2 / 3  # of a figure's pixels: all words on the page are then of one size
+LEGIBLE = 0.43  # of a figure's pixels: letters of 9.5 points at 160 dots an inch are then 9 pixels high
+FILES: Mapping[str, str] = {"PDF": "pdf", "numbers": "csv"}
 FOLDED = 6  # quantities of a claim that are shown at once
 EPISODE_WORDS: Mapping[str, str] = {
     "coverage": "Left a trained policy, its lines what its coordinator assigns; then each sensor seeking its own best "
@@ -32,7 +35,7 @@ MARKS: Mapping[str, str] = {  # a sign for each verdict, beside its colour
     "not reproduced": "✗",
     "too short to judge": "…",
     "untestable": "?",
-    "contradicted by the paper itself": "⚡",
+    "contradicted by the paper itself": "≠",
 }
 
 
@@ -61,11 +64,11 @@ class Plate(NamedTuple):
     heading: str
     caption: str
     alt: str
-    kind: str
-    data: str
+    address: str
     width: int
     height: int
     shown: int  # pixels of the page that it takes, if there is room
+    least: int  # pixels that it takes on a narrow page, where it scrolls: its words are legible
     behind: str
     files: list[tuple[str, str]]
     fault: str = ""  # why there is nothing to see
@@ -83,6 +86,12 @@ class Section(NamedTuple):
     more_grids: list[Grid]
 
     @property
+    def short(self) -> str:
+        """The title in a word, for the list of parts."""
+        name = self.title.partition(" (")[0].removeprefix("Study ").partition(" and ")[0].removeprefix("The ")
+        return name[:1].upper() + name[1:]
+
+    @property
     def more(self) -> str:
         """The parts that are folded away, in words."""
         figures = [plate.heading.partition(", study ")[0] for plate in self.more_plates]
@@ -98,26 +107,28 @@ def render(content: Mapping[str, Any]) -> str:
     return env.get_template(TEMPLATE).render(content)
 
 
-def plate(picture: Picture, folder: Path, behind: str) -> Plate:
-    """A figure from its PNG in a folder, or its place. behind: the command that made its numbers."""
-    kinds = {"PDF": "pdf", "numbers": "csv"}
-    names = {word: f"{picture.name}.{kind}" for word, kind in kinds.items()}
-    files = [(word, f"figures/{name}") for word, name in names.items() if (folder / name).exists()]
-    if picture.fault:
-        about = (picture.name, picture.heading, picture.caption, "", "", "")
-        return Plate(*about, 0, 0, 0, behind, files, picture.fault)
-    data = (folder / f"{picture.name}.png").read_bytes()
-    width, height = int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")  # of the PNG's header
-    about = (picture.name, picture.heading, picture.caption, picture.alt, "png", b64encode(data).decode())
-    return Plate(*about, width, height, round(width * SHOWN), behind, files)
+def plate(picture: Picture, behind: str) -> Plate:
+    """A figure as it was drawn, or its place. behind: the command that made its numbers."""
+    kinds = ("PDF", "numbers") if picture.shown else ("numbers",) if picture.drawing else ()
+    files = [(word, f"figures/{picture.name}.{FILES[word]}") for word in kinds]
+    about = (picture.name, picture.heading, picture.caption, picture.alt)
+    if picture.shown is None:
+        return Plate(*about, "", 0, 0, 0, 0, behind, files, picture.fault)
+    width, height = picture.shown.size
+    return Plate(
+        *about, picture.shown.address, width, height, round(width * SHOWN), round(width * LEGIBLE), behind, files
+    )
 
 
-def episode(task: str, gif: bytes) -> Plate:
-    """An animation from what `rhmc render` wrote, or its place."""
-    width, height = int.from_bytes(gif[6:8], "little"), int.from_bytes(gif[8:10], "little")  # of the GIF's header
+def episode(task: str, gif: bytes, folder: str) -> Plate:
+    """An animation from what `rhmc render` wrote, or its place. folder: of the GIF, which is linked; "" if far away."""
     words = EPISODE_WORDS.get(task, "A trained policy, and others in the same episode.")
-    about = (f"episode_{stem(task)}", f"An episode of {task}", words, words, "gif", b64encode(gif).decode())
-    return Plate(*about, width, height, width, "rhmc render", [], animation_fault(gif))
+    about = (f"episode_{stem(task)}", f"An episode of {task}", words, words)
+    if fault := animation_fault(gif):
+        return Plate(*about, "", 0, 0, 0, 0, "rhmc render", [], fault)
+    address, (width, height) = embed.animation(gif)
+    files = [("GIF", f"{folder}/{quote(f'episode_{task}.gif')}")] if folder else []
+    return Plate(*about, address, width, height, width, round(width * SHOWN), "rhmc render", files)
 
 
 def animation_fault(gif: bytes) -> str:
@@ -150,21 +161,20 @@ def sort_key(text: str) -> str:
 
 
 def verdicts(claims: Sequence[Claim]) -> list[dict[str, Any]]:
-    """The number of claims with each verdict, and the number of them that are provisional."""
-    found = []
-    for verdict in VERDICTS:
-        mine = [claim for claim in claims if claim.verdict == verdict]
-        if mine:
-            provisional = sum(claim.provisional for claim in mine)
-            found.append({"verdict": verdict, "mark": MARKS[verdict], "count": len(mine), "provisional": provisional})
-    return found
+    """The verdicts that claims have, with their looks."""
+    there = {claim.verdict: claim for claim in claims}
+    return [looks(there[verdict]) | {"verdict": verdict} for verdict in VERDICTS if verdict in there]
+
+
+def looks(claim: Claim) -> dict[str, Any]:
+    """The sign of a verdict, and the word that its colour and its marker go by."""
+    return {"mark": MARKS[claim.verdict], "kind": claim.verdict.split()[0]}
 
 
 def card(claim: Claim) -> dict[str, Any]:
     """A claim as the page shows it."""
     ours = [{"name": name, "value": value} for name, value in described(claim.ours)]
-    shown = {"ours": ours, "mark": MARKS[claim.verdict], "kind": claim.verdict.split()[0]}
-    return claim._asdict() | shown | {"provisional": claim.provisional, "judged": claim.verdict in JUDGED}
+    return claim._asdict() | looks(claim) | {"ours": ours, "provisional": claim.provisional}
 
 
 def provenance(results: Results) -> list[tuple[str, str]]:

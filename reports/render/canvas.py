@@ -52,6 +52,8 @@ STYLE: dict[str, Any] = {
     "xtick.major.size": 0,
     "ytick.major.size": 0,
     "pdf.fonttype": 42,
+    "svg.fonttype": "none",  # words as words
+    "svg.hashsalt": "rhmc",  # the same names of parts every time
     "savefig.dpi": 160,
 }
 MARGIN = 0.03  # of words left of the axes

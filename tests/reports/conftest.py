@@ -1,6 +1,7 @@
 """Fixtures of the reports' tests."""
 
 from collections.abc import Iterator
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +28,11 @@ def quick_resampling(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def unpainted(monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures are made and their files are empty, for tests of names and words: paint is most of a report's time."""
 
-    def empty(self: Figure, path: Path, **options: Any) -> None:
-        path.write_bytes(b"")
+    def empty(self: Figure, place: Path | StringIO, **options: Any) -> None:
+        if isinstance(place, StringIO):
+            place.write("<svg></svg>")
+        else:
+            place.write_bytes(b"")
 
     monkeypatch.setattr(Figure, "savefig", empty)
 

@@ -19,7 +19,7 @@ import pytest
 from reports.data import paper
 from reports.data.frame import TableError, load
 from reports.pages import build as report
-from reports.pages import gallery
+from reports.pages import gallery, sheets
 from reports.pages.build import build, write_report
 from reports.render import diagrams, figures, tables
 from tests.reports.factory import drawings, episode, methods, noisy, reporting, study, write, yardsticks
@@ -298,7 +298,7 @@ def test_an_animation_that_is_none_keeps_its_place(make: Plant, tmp_path: Path) 
 
 
 @pytest.mark.parametrize(
-    ("module", "name"), [(tables, "finals"), (report.rules, "judge"), (report.comparison, "pairs_table")]
+    ("module", "name"), [(tables, "finals"), (report.rules, "judge"), (sheets.comparison, "pairs_table")]
 )
 def test_evidence_that_fails_is_an_error(
     module: Any, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -37,8 +37,16 @@ found.files = links.filter((href) => !href.startsWith("#"));
 found.blank = [...document.images].filter((image) => !image.naturalWidth).length;
 found.unnamed = [...document.images].filter((image) => image.alt.length < 20).length;
 found.images = document.images.length;
+const rows = [...document.querySelectorAll(".forest li a")].map((row) => row.getBoundingClientRect());
+found.rows = {count: rows.length, end: rows.at(-1).bottom, least: Math.min(...rows.map((row) => row.height))};
+found.spoken = [...document.querySelectorAll(".forest li a .sr")].filter((one) => one.textContent.length < 30).length;
+const letters = (image) => 9.5 / 72 * 160 * image.getBoundingClientRect().width / image.getAttribute("width");
+const plates = [...document.images].filter((image) => image.getBoundingClientRect().width && image.src.includes("svg"));
+found.letters = Math.min(...plates.map(letters));
+document.querySelector(".forest li a").focus({focusVisible: true});
+found.ring = getComputedStyle(document.activeElement).outlineStyle;
 found.wide = document.documentElement.scrollWidth - document.documentElement.clientWidth;
-const run = document.querySelector("#C8 a[href^='#run-']").getAttribute("href");
+const run = document.querySelector("#C8a a[href^='#run-']").getAttribute("href");
 found.folded = !document.querySelector(run).closest("details").open;
 location.hash = run;
 setTimeout(() => {
@@ -77,17 +85,18 @@ def copy(made: Path, folder: Path, more: str = "") -> Path:
 def test_it_opens_sorts_and_leads_on(made: Path, tmp_path: Path) -> None:
     found, console = visit(copy(made, tmp_path))
     assert console == []
-    assert found["before"] == ["70.0 [69.0, 71.0]", "64.0 [63.0, 65.0]", "60.0 [59.0, 61.0]"]
+    assert found["before"] == ["70.0 (69.0 to 71.0)", "64.0 (63.0 to 65.0)", "60.0 (59.0 to 61.0)"]
     assert found["up"] == found["before"][::-1]
     assert found["down"] == found["before"]
     assert found["state"] == [None, "ascending", None, None, None]
     assert found["said"].startswith("Final results of study ablation sorted by Final return")
-    assert found["reach"] == ["63.0 [62.0, 64.0]", "68.0"]
+    assert found["reach"] == ["63.0 (62.0 to 64.0)", "68.0"]
     assert found["lost"] == []
     assert len(found["files"]) > 20
     assert [name for name in found["files"] if not (made / name).exists()] == []
     assert (found["blank"], found["unnamed"]) == (0, 0)
     assert found["images"] > 8
+    assert (found["rows"]["count"], found["spoken"], found["ring"]) == (23, 0, "solid")
     assert found["folded"]
     assert found["unfolded"]
 
@@ -96,6 +105,9 @@ def test_it_opens_sorts_and_leads_on(made: Path, tmp_path: Path) -> None:
 def test_nothing_reaches_out_of_a_narrow_or_dark_page(made: Path, tmp_path: Path, size: str, scheme: str) -> None:
     found, console = visit(copy(made, tmp_path), size, scheme)
     assert found["wide"] <= 0
+    assert found["letters"] >= 9
+    assert found["rows"]["least"] >= 22
+    assert found["rows"]["end"] <= 800  # the first screen has the whole answer
     assert console == []
 
 

@@ -315,7 +315,7 @@ def test_a_failure_half_way_leaves_the_old_report(
 ) -> None:
     out = Path(shutil.copytree(little, tmp_path / "out"))
     before = content(out)
-    monkeypatch.setattr(report, "_index", lambda *_: 1 / 0)
+    monkeypatch.setattr(report.index, "page", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         build(few, out, "quick")
     assert content(out) == before

@@ -4,17 +4,20 @@ import re
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
+from urllib.parse import unquote
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from reports.data.frame import TableError
+from reports.data.paper import read as paper
 from reports.pages import page
 from reports.pages.build import build, write_report
-from tests.reports.factory import noisy, study, write, yardsticks
+from tests.reports.factory import NAVIGATION, drawings, episode, methods, noisy, study, write, yardsticks
 
 pytestmark = pytest.mark.usefixtures("quick_resampling")
+LAST = ("definitions", "provenance", "runs")
 VOID = {"meta", "img", "br", "link", "hr", "input"}
 
 
@@ -55,12 +58,17 @@ def read(made: Path) -> Reader:
 
 
 def test_nothing_is_fetched(made: Path, read: Reader) -> None:
-    text = re.sub(r"data:image/(png|gif);base64,[A-Za-z0-9+/=]+", "", (made / "index.html").read_text())
+    text = re.sub(r'"data:image/[^"]+"', '""', (made / "index.html").read_text())
     assert "http://" not in text.replace("http://www.w3.org", "")
     assert "https://" not in text
     assert not re.search(r"@import|url\(|<link|<script src", text)
-    kinds = {image["src"].partition(";")[0] for image in read.of("img")}
-    assert kinds == {"data:image/png", "data:image/gif"}
+    kinds = {re.split("[;,]", image["src"])[0] for image in read.of("img")}
+    assert kinds == {f"data:image/{kind}" for kind in ("svg+xml", "webp")}
+    for image in read.of("img"):
+        drawn = unquote(image["src"].partition(",")[2]) if "svg" in image["src"][:20] else ""
+        assert not re.search(
+            r"(href|src)=.(?!#|data:)|@import|url\((?!#)", drawn
+        )  # of itself it shows parts, and no files
 
 
 def test_every_link_leads_somewhere(made: Path, read: Reader) -> None:
@@ -83,11 +91,21 @@ def test_every_figure_has_words_for_those_who_do_not_see_it(made: Path, read: Re
     assert "Fig. 9" not in read.text  # no study of it
 
 
-def test_claims_come_first_with_all_that_belongs_to_them(read: Reader) -> None:
+def test_the_answer_comes_first_and_the_evidence_after_the_results(made: Path, read: Reader) -> None:
+    text = (made / "index.html").read_text()
+    places = [text.index(f'id="{name}"') for name in ("main", "forest", "study-ablation", "method", "studies")]
+    assert places == sorted(places)
     parts = [attributes["id"] for attributes in read.of("section")]
-    assert parts[0] == "claims"
-    assert parts[1] == "method"
-    assert parts[-4:] == ["missing", "definitions", "provenance", "runs"]
+    assert parts == ["study-ablation", "method", "study-reach", "scale", "claims", "missing", *LAST]
+    assert text.index(page_sentence(made)) < text.index('id="forest"')
+
+
+def page_sentence(made: Path) -> str:
+    """The bold sentence of the page in Markdown: that of the other page."""
+    return next(line.strip("*") for line in (made / "index.md").read_text().splitlines() if line.startswith("**Of "))
+
+
+def test_claims_have_all_that_belongs_to_them(read: Reader) -> None:
     assert len(list(read.of("article"))) == 23
     for words in (
         "Without the regulation mechanism the final reward falls.",
@@ -123,6 +141,35 @@ def test_a_half_finished_study_says_so(made: Path, read: Reader) -> None:
     listed = pd.read_csv(made / "tables" / "runs.csv").set_index("status")["final_return"]
     assert np.isnan(listed["missing"])
     assert np.isnan(listed["partial"])
+
+
+@pytest.mark.usefixtures("unpainted")
+def test_an_animation_leads_to_its_gif_where_that_is_beside_the_page(tmp_path: Path) -> None:
+    runs = write(episode(methods(tmp_path / "runs")), study("coverage", {"RHMC": noisy(67)}, points=3))
+    for out, linked in ((tmp_path, True), (tmp_path / "far", False)):
+        build(runs, out, "quick")
+        links = {link["href"] for link in Reader((out / "index.html").read_text()).of("a")}
+        assert ("runs/episode_coverage.gif" in links) is linked
+
+
+@pytest.mark.usefixtures("unpainted", "quick_resampling")
+def test_a_complete_report_does_not_speak_of_what_is_missing(tmp_path: Path) -> None:
+    finals = {arm: noisy(60) for arms in paper().arms.values() for arm in arms}
+    coverage, navigation = ({arm: finals[arm] for arm in paper().arms[name]} for name in ("coverage", "navigation"))
+    both = (yardsticks(), yardsticks({"nearest": -35.0}, NAVIGATION))
+    tables = (
+        study("ablation", {arm: finals[arm] for arm in paper().arms["ablation"]}, points=3),
+        study("coverage", coverage, points=3),
+        study("navigation", navigation, env=NAVIGATION, points=3),
+        study("scaling", {"RHMC": noisy(60)}, points=3),
+        (pd.concat(points for points, _ in both), pd.concat(runs for _, runs in both)),
+    )
+    build(write(drawings(episode(methods(tmp_path / "runs"))), *tables), tmp_path / "out", "quick")
+    read = Reader((tmp_path / "out" / "index.html").read_text())
+    assert "issing" not in read.text
+    assert "Not everything" not in read.text
+    assert "missing" not in {attributes.get("id") for _, attributes in read.tags}
+    assert "Nothing: every planned run is finished." in (tmp_path / "out" / "index.md").read_text()
 
 
 def test_what_made_the_runs(read: Reader) -> None:

@@ -1,0 +1,139 @@
+"""The content of the page: its parts in their order, by the names of its template."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, TypeVar
+
+from reports.analyses import searches
+from reports.claims import verdicts as rules
+from reports.data.escaping import stem, words
+from reports.data.frame import Results, mixed
+from reports.pages import answer, forest, page, sheets
+from reports.pages.report import Report, definitions, question
+from reports.render.tables import SPAN, Table
+
+DRAWN = "rhmc drawings"
+MORE = ("profile_", "better_", "pairs_", "efficiency_", "steadiness_", "time_", "settings_", "yardsticks")
+METHOD, SCALE = "method", "scale"  # parts that are no study's
+
+Part = TypeVar("Part")
+
+
+def of(report: Report) -> Mapping[str, Any]:
+    """The content of the page, by the names of its template."""
+    results = report.results
+    runs = report.tables["runs"]
+    results_of, method, others = _sections(report)
+    return {
+        **_head(report),
+        "sections": [*results_of, *method],
+        "others": others,
+        "claims": [page.card(claim) for claim in report.claims],
+        "folded": page.FOLDED,
+        "span": SPAN,
+        "gaps": [words(gap) for gap in report.gaps],
+        "definitions": definitions(results),
+        "mixed": mixed(results.runs),
+        "aside": words(results.set_aside) if report.paper else "",
+        "provenance": page.provenance(results),
+        "made": page.grid("provenance", report.tables["provenance"]),
+        "runs": page.grid("runs", runs),
+        "counted": "runs" if set(results.runs["study"]) <= set(results.studies) else "runs, with yardsticks",
+        "ids": [f"run-{stem(run)}" if first else "" for run, first in _first_seen(runs)],
+        "foot": f"Built from the exported tables of profile {results.profile}; the same tables give the same page.",
+    }
+
+
+def _head(report: Report) -> dict[str, Any]:
+    """What stands above all parts: the answer of a report on the paper, the question of one on a study."""
+    asked = report.paper is None
+    return {
+        "title": report.title,
+        "lead": report.lead if asked else "",
+        "paper": report.paper.source if report.paper else None,
+        "profile": report.results.profile,
+        "warnings": [words(report.smoke)] if report.smoke else [],
+        "notes": [words(report.results.set_aside)] if asked and report.results.set_aside else [],
+        "sentence": "" if asked else answer.sentence(report.claims),
+        "questions": [] if asked else answer.questions(report),
+        "open": report.open if asked else 0,
+        "rows": [_row(row) for row in forest.rows(report.claims)],
+        "ticks": forest.ticks(),
+        "scale": forest.scale(report.claims),
+        "middle": forest.place(0),
+        "verdicts": page.verdicts(report.claims),
+    }
+
+
+def _row(row: forest.Row) -> dict[str, Any]:
+    """A row of the plot with its looks."""
+    return row._asdict() | page.looks(row.claim)
+
+
+def _first_seen(runs: Table) -> Iterator[tuple[str, bool]]:
+    """Run ids in the order of the table, and whether it is the first row of that run: it may stand in two studies."""
+    seen: set[str] = set()
+    for run in runs.numbers["run"].astype(str):
+        yield run, run not in seen
+        seen.add(run)
+
+
+def _sections(report: Report) -> tuple[list[page.Section], list[page.Section], list[page.Section]]:
+    """The paper's studies, the method and its tasks, and what goes beyond: further studies, searches, what is left.
+
+    In the report of one study, which has no claims, that study is the first part.
+    """
+    first, rest = (report.own, report.others) if report.paper else (report.results.studies, [])
+    owners = {stem(study): study for study in report.results.studies}
+    of_table = {name: owner for name in report.tables if (owner := owners.get(_of_study(name)))}
+    of_table |= {name: "ablation" for name in ("table_2",) if name in report.tables}
+
+    def of_study(study: str) -> page.Section:
+        names = [name for name, owner in of_table.items() if owner == study]
+        return _section(report, f"study-{stem(study)}", _heading(report.results, study), study, names)
+
+    found = {name: sheets.winners(name) for name in report.results.searches}
+    searched = [
+        _section(report, f"search-{stem(name)}", searches.heading(report.results, name), name, [table])
+        for name, table in found.items()
+    ]
+    elsewhere = {"table_1", *sheets.LAST, *of_table, *found.values()}
+    left = [name for name in report.tables if name not in elsewhere]
+    method = _section(report, METHOD, "The method and its tasks", "", ["table_1"])
+    scale = _section(report, SCALE, "Yardsticks, transfer, encoder, Theorem 1", "-", left)
+    parts = [of_study(name) for name in first], [method], [*(of_study(name) for name in rest), *searched, scale]
+    mine, how, others = ([part for part in some if part.plates or part.grids] for some in parts)
+    return (mine, how, others) if report.paper else ([*mine, *others], how, [])
+
+
+def _of_study(name: str) -> str:
+    """The part of a table's name that follows its kind."""
+    kind, _, rest = name.partition("_")
+    return rest if kind in sheets.KINDS else ""
+
+
+def _section(report: Report, name: str, title: str, study: str, names: Sequence[str]) -> page.Section:
+    results = report.results
+    known = study in (*results.studies, *results.searches)
+    made = rules.command(study, results.profile) if study in results.studies else DRAWN
+    plates = {p.name: page.plate(p, p.behind or made.partition(" && ")[0]) for p in report.pictures if p.study == study}
+    if name == METHOD:
+        episodes = [page.episode(task, gif, report.tables_at) for task, gif in results.episodes.items()]
+        plates |= {plate.name: plate for plate in episodes}
+    grids = {key: page.grid(key, report.tables[key]) for key in names if key in report.tables}
+    return page.Section(name, title, question(results, study) if known else "", *_parted(plates), *_parted(grids))
+
+
+def _parted(found: Mapping[str, Part]) -> tuple[list[Part], list[Part]]:
+    """The parts that are shown at once, and those that are folded away."""
+    shown = [x for key, x in found.items() if not _folded(key)]
+    return shown, [x for key, x in found.items() if _folded(key)]
+
+
+def _folded(name: str) -> bool:
+    """True if a figure or a table is folded away: what looks at the same runs in yet another way."""
+    return name.startswith(MORE) or name.endswith("_arms")
+
+
+def _heading(results: Results, study: str) -> str:
+    done, plan = int((results.plan(study)["status"] == "finished").sum()), len(results.plan(study))
+    return f"Study {study}" + ("" if done == plan else f" ({done} of {plan} runs finished)")
