@@ -48,7 +48,7 @@ repro: $(READY) ## Train, track and report on the profile in params.yaml; an int
 	  echo "Report:    $$out/index.html"; \
 	  echo "MLflow UI: run \`make ui\` and open the address that it prints"; \
 	  test ! -d "results/published/$$profile" || \
-	    rhmc verify --runs "$$out/runs" --profile "$$profile" || test $$? -eq 1
+	    rhmc verify --runs "$$out/runs" --profile "$$profile" || test $$? -eq 4
 
 test: check ## Lint, types and every test
 	@python -m pytest -n $(JOBS) $(SHARED)

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from pipelines.specs.study import Study
 
 Loaded = TypeVar("Loaded")
-DONE, UNFINISHED, BAD, INTERRUPTED = 0, 1, 2, 130  # exit codes
 WIDTH = 140  # columns of a table that is not shown on a terminal
 
 SET_HELP = (

@@ -9,7 +9,10 @@ from pipelines.cli.common import Profile, folder_option, profile_faults, say, ta
 from pipelines.specs.limits import EPISODES, SEED
 from pipelines.specs.safe_names import PROFILES, fault_of_study, simple, study_name
 from pipelines.workspace.errors import InputError, visible_lines
+from pipelines.workspace.exit_codes import Exit
 from pipelines.workspace.files import fault_of, regular
+
+REPORTED = {"whole": Exit.DONE, "undrawn": Exit.UNFINISHED, "refused": Exit.BAD}
 
 
 def theorem(
@@ -115,4 +118,4 @@ def report(
     from reports.pages.build import write_report
 
     name = study_name(study, variant or "") if study else None
-    raise typer.Exit(write_report(runs, out, profile, name, visible_lines))
+    raise typer.Exit(REPORTED[write_report(runs, out, profile, name, visible_lines)])

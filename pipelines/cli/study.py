@@ -9,9 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pipelines.cli.common import (
-    BAD,
-    DONE,
-    UNFINISHED,
     File,
     Files,
     Json,
@@ -26,6 +23,7 @@ from pipelines.cli.common import (
     tell,
 )
 from pipelines.workspace.errors import InputError
+from pipelines.workspace.exit_codes import Exit
 from pipelines.workspace.files import regular
 
 if TYPE_CHECKING:
@@ -111,7 +109,7 @@ def run(files: Files, profile: Profile = "quick", variant: Variant = None, overr
 def status(
     file: File, profile: Profile = "quick", variant: Variant = None, as_json: Json = False, overrides: Sets = None
 ) -> None:
-    """Say how many runs are finished, under way, missing or stale (made by other code). Exit code 1 if any is left."""
+    """Say how many runs are finished, under way, missing or stale (made by other code). Exit code 3 if any is left."""
     study = load_study(file, profile, overrides, variant)
     from pipelines.execution.run import show_status
     from pipelines.workspace.work_folder import work_folder
@@ -230,7 +228,7 @@ def adopt_runs(
 ) -> None:
     """Let finished runs of other code count for the code here, where trainings of today repeat them bit for bit.
 
-    Exit code 1 if an arm is refused: the first value that differs is named, and its runs stay as they are.
+    Exit code 4 if an arm is refused: the first value that differs is named, and its runs stay as they are.
     """
     from pipelines.execution.adoption import adopt
     from pipelines.workspace.work_folder import work_folder
@@ -240,7 +238,7 @@ def adopt_runs(
         say(f"{study.name} ({study.profile})")
         proofs = adopt(study, work_folder(), verify, until, jobs, say)
         refused = refused or any(proof.difference for proof in proofs)
-    raise typer.Exit(UNFINISHED if refused else DONE)
+    raise typer.Exit(Exit.NO if refused else Exit.DONE)
 
 
 def export(
@@ -258,11 +256,11 @@ def export(
     if faults := given_twice(studies):
         raise InputError(*faults)
 
-    code = DONE
+    code: int = Exit.DONE
     for study in studies:
         code = max(code, export_study(study, out or Path("results") / profile / "runs"))
-        if code == BAD:
-            raise typer.Exit(BAD)
+        if code == Exit.BAD:
+            raise typer.Exit(Exit.BAD)
     words = ["rhmc", "report", *(["--study", str(files[0])] if len(files) == 1 else [])]
     words += ["--profile", profile] if profile != "quick" else []
     words += ["--variant", variant] if variant and len(files) == 1 else []

@@ -25,14 +25,13 @@ from pipelines.tracking.staleness import stale_lines, stale_runs
 from pipelines.tracking.tracker import Tracker
 from pipelines.workspace.addresses import without_password
 from pipelines.workspace.errors import InputError, visible
+from pipelines.workspace.exit_codes import Exit
 from pipelines.workspace.provenance import Host, host
 from pipelines.workspace.terminal import terminal
 from pipelines.workspace.work_folder import Home, StoreError
 
 if TYPE_CHECKING:
     from pipelines.tracking.mlflow_tracker import MlflowTracker
-
-DONE, FAILED, BAD, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143  # exit codes
 
 
 def run_studies(studies: Sequence[Study], home: Path) -> int:
@@ -46,7 +45,7 @@ def run_studies(studies: Sequence[Study], home: Path) -> int:
         home: the work folder.
 
     Returns:
-        0 all finished, 1 some run failed, 2 environment error, 130 interrupted, 143 terminated. A second launch
+        0 all finished, 3 some run failed, 2 environment error, 130 interrupted, 143 terminated. A second launch
         is always safe.
 
     Raises:
@@ -100,13 +99,13 @@ def guarded(home: Path, names: Sequence[tuple[str, str]], launch: Callable[[Home
             return launch(place, interrupts)
     except StoreError as error:
         print(f"rhmc: {error}", file=sys.stderr)
-        return BAD
+        return Exit.BAD
     except KeyboardInterrupt:
         print("rhmc: interrupted; the same command continues", file=sys.stderr)
         return interrupts.code
     except SystemExit:  # Ray's answer to SIGTERM while it starts
         print("rhmc: terminated; the same command continues", file=sys.stderr)
-        return TERMINATED
+        return Exit.TERMINATED
 
 
 class Interrupts:
@@ -119,7 +118,8 @@ class Interrupts:
     """
 
     def __init__(self) -> None:
-        self.code, self.came = INTERRUPTED, False
+        self.code: int = Exit.INTERRUPTED
+        self.came = False
         self.stop: Path | None = None  # the file that asks
 
     def __enter__(self) -> Self:
@@ -192,7 +192,7 @@ def _launch(studies: Sequence[Study], home: Home, interrupts: Interrupts) -> int
             one.recorder.overview.publish()
     _summary(launched)
     found = {one.recorder.status for one in launched}
-    return FAILED if "failed" in found else interrupts.code if "interrupted" in found else DONE
+    return Exit.UNFINISHED if "failed" in found else interrupts.code if "interrupted" in found else Exit.DONE
 
 
 @contextmanager
@@ -323,13 +323,13 @@ def show_status(study: Study, home: Path, *, as_json: bool = False) -> int:
     """Print how far a study is: per arm the runs finished, under way, failed (and why), missing, and stale (and why).
 
     Returns:
-        0 all finished, 1 not, 2 environment error.
+        0 all finished, 3 not, 2 environment error.
     """
     try:
         found = _status(study, Home(home))
     except StoreError as error:
         print(f"rhmc: {error}", file=sys.stderr)
-        return BAD
+        return Exit.BAD
     if as_json:
         print(json.dumps({"study": study.name, "profile": study.profile} | found._asdict()))
     else:
@@ -339,7 +339,7 @@ def show_status(study: Study, home: Path, *, as_json: bool = False) -> int:
         lines = [f"failed: {name}: {error}" for name, error in found.errors.items()]
         lines += [*found.stale, *(f"note: {remark}" for remark in (*study.remarks, *found.remarks))]
         terminal().print("\n".join(map(visible, lines)), soft_wrap=True, end="\n" if lines else "")
-    return DONE if found.finished else FAILED
+    return Exit.DONE if found.finished else Exit.UNFINISHED
 
 
 class Standing(NamedTuple):

@@ -19,7 +19,7 @@ from ruamel.yaml import YAML
 
 from pipelines.execution.progress import Board, StopFile, board, print_table
 from pipelines.execution.ray_settings import set_up_ray
-from pipelines.execution.run import BAD, DONE, FAILED, Interrupts, guarded, missing_devices
+from pipelines.execution.run import Interrupts, guarded, missing_devices
 from pipelines.specs.search import Search
 from pipelines.specs.source_file import another, remember
 from pipelines.tracking.plan import read_commit
@@ -29,6 +29,7 @@ from pipelines.tuning.trials import OBJECTIVE, ArmStudy, BaseStorage, TrialReque
 from pipelines.workspace.addresses import without_password
 from pipelines.workspace.best_effort import decoration
 from pipelines.workspace.errors import InputError, visible
+from pipelines.workspace.exit_codes import Exit
 from pipelines.workspace.terminal import terminal
 from pipelines.workspace.work_folder import Checkpoints, Home, StoreError
 from reports.data.escaping import markdown, prose
@@ -66,7 +67,7 @@ def run_search(search: Search, home: Path, out: Path | None = None) -> int:
             the search was changed by overrides: a trial of the tool does not replace the result of a real search.
 
     Returns:
-        0 every trial is finished or pruned, 1 some failed, 2 environment error, 130 interrupted, 143 terminated.
+        0 every trial is finished or pruned, 3 some failed, 2 environment error, 130 interrupted, 143 terminated.
     """
 
     def launch(place: Home, interrupts: Interrupts) -> int:
@@ -123,7 +124,7 @@ def _launch(search: Search, home: Home, storage: BaseStorage, out: Path, interru
     finally:
         tracker.close(status)
     _summary(search, arm_studies, tracker, written, whole)
-    return {"finished": DONE, "failed": FAILED}.get(status, interrupts.code)
+    return {"finished": int(Exit.DONE), "failed": int(Exit.UNFINISHED)}.get(status, interrupts.code)
 
 
 def _clear(search: Search, arm_study: ArmStudy, home: Home) -> None:
@@ -476,18 +477,19 @@ def show_search(search: Search, home: Path) -> int:
     """Print how far a search is: trials by state, the best so far, and those of other settings or code (stale).
 
     Returns:
-        0 every trial is closed, 1 not, 2 environment error.
+        0 every trial is closed, 3 not, 2 environment error.
     """
     place = Home(home)
     try:
         with opened(place, write=False) as storage, explained(storage_url(place)):
             if storage is None:
                 print(f"{search.name} ({search.profile}): nothing has been tried yet")
-                return FAILED
+                return Exit.UNFINISHED
             found = [look(search, arm, storage) for arm in search.arms]
             print_table(terminal(), [*HEADER, "stale"], [[*_row(arm_study), str(stale)] for arm_study, stale in found])
             print("\n".join(_best_line(arm_study) for arm_study, _ in found))
-            return DONE if all(arm_study.closed >= search.trials for arm_study, _ in found) else FAILED
+            whole = all(arm_study.closed >= search.trials for arm_study, _ in found)
+            return Exit.DONE if whole else Exit.UNFINISHED
     except StoreError as error:
         print(f"rhmc: {error}", file=sys.stderr)
-        return BAD
+        return Exit.BAD

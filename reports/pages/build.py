@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 from reports.analyses import alpha, beyond, comparison, readings, scaling, searches, settings
 from reports.claims import verdicts as rules
@@ -26,8 +26,8 @@ from reports.render.canvas import save, write_csv
 from reports.render.glyphs import LOST
 from reports.render.tables import MEASURED, SPAN, TABLES, Table, joined, steps
 
+Outcome = Literal["whole", "undrawn", "refused"]  # of a report
 PART = ".report-"  # begins the name of the folder in which a report is made
-DONE, UNDRAWN, BAD = 0, 1, 2  # exit codes
 MADE = ("figures", TABLES, MEASURED, "claims.md", "claims.csv", "claims.json", "index.md", "index.html")
 
 DEFINITIONS = (
@@ -162,7 +162,7 @@ def write_report(
     profile: str = "quick",
     study: str | None = None,
     shown: Callable[[str], str] = str,
-) -> int:
+) -> Outcome:
     """Build a report as `build` does, and say on the terminal what became of it.
 
     Args:
@@ -172,7 +172,8 @@ def write_report(
         study: report on this one alone.
         shown: how a message is printed, which names folders as they were typed.
 
-    Returns 0, 1 if a figure could not be drawn, 2 if the tables are faulty: then nothing is written.
+    Returns:
+        `undrawn` if a figure could not be drawn; `refused` if the tables are faulty: then nothing is written.
     """
     home = Path("results") / profile
     out = out or (home / "study" / study if study else home)
@@ -180,11 +181,11 @@ def write_report(
         built = build(runs or home / "runs", out, profile, study)
     except (TableError, PaperError, OutError) as error:
         print(shown(str(error)), file=sys.stderr)
-        return BAD
+        return "refused"
     for line in [*built.undrawn, *([f"note: {built.note}"] if built.note else [])]:
         print(shown(line), file=sys.stderr)
     print(shown(f"{len(built.files)} files; start with {out / 'index.html'}"))
-    return UNDRAWN if built.undrawn else DONE
+    return "undrawn" if built.undrawn else "whole"
 
 
 def _whole(results: Results, paper: Paper) -> Report:

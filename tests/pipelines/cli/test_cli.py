@@ -226,7 +226,7 @@ def test_list_for_scripts(rhmc: Rhmc) -> None:
 def test_status_for_scripts(rhmc: Rhmc) -> None:
     said = rhmc("study", "status", "studies/x.yaml", "--json")
     none = {"planned": 2, "finished": 0, "running": 0, "interrupted": 0, "failed": 0, "missing": 2, "stale": 0}
-    assert (said.code, said.err) == (1, "")
+    assert (said.code, said.err) == (3, "")
     arms = {"full": none, "none": none}
     expected = {
         "study": "x",
@@ -276,7 +276,7 @@ def test_the_doctor_answers_with_lines_and_an_exit_code(
 ) -> None:
     given = Finding(level, "disk", "text")
     monkeypatch.setattr("pipelines.cli.checks.examine", lambda home, *, ray: iter([given] * (2 - ray)))
-    assert rhmc("doctor").code == (level == "fault")
+    assert rhmc("doctor").code == (4 if level == "fault" else 0)
     assert rhmc("doctor", "--no-ray").out.splitlines() == [f"{MARK[level]}  disk: text"] * 2
     assert json.loads(rhmc("doctor", "--json").out) == [{"level": level, "what": "disk", "text": "text"}]
 
@@ -325,10 +325,10 @@ def test_studies_that_cannot_run_together(rhmc: Rhmc, tmp_path: Path) -> None:
 
 def test_export_goes_to_the_folder_of_the_profile(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[tuple[Any, ...]] = []
-    monkeypatch.setattr("pipelines.export.tables.export_study", lambda study, out: calls.append((study.name, out)) or 1)
+    monkeypatch.setattr("pipelines.export.tables.export_study", lambda study, out: calls.append((study.name, out)) or 3)
     report = "next:  rhmc report --study studies/x.yaml"
-    assert rhmc("export", "studies/x.yaml", "--profile", "paper") == (1, "", f"{report} --profile paper\n")
-    assert rhmc("export", "studies/x.yaml", "--out", "there") == (1, "", f"{report} --runs there\n")
+    assert rhmc("export", "studies/x.yaml", "--profile", "paper") == (3, "", f"{report} --profile paper\n")
+    assert rhmc("export", "studies/x.yaml", "--out", "there") == (3, "", f"{report} --runs there\n")
     monkeypatch.setattr("pipelines.export.tables.export_study", lambda study, out: 2)
     assert rhmc("export", "studies/x.yaml") == (2, "", "")
     assert calls == [("x", Path("results/paper/runs")), ("x", Path("there"))]
@@ -336,10 +336,10 @@ def test_export_goes_to_the_folder_of_the_profile(rhmc: Rhmc, monkeypatch: pytes
 
 def test_export_of_several_studies(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copy("studies/x.yaml", "studies/y.yaml")
-    codes = {"x": 1, "y": 0}
+    codes = {"x": 3, "y": 0}
     monkeypatch.setattr("pipelines.export.tables.export_study", lambda study, out: codes[study.name])
     words = ["export", "studies/x.yaml", "studies/y.yaml"]
-    assert rhmc(*words) == (1, "", "next:  rhmc report\n")
+    assert rhmc(*words) == (3, "", "next:  rhmc report\n")
     codes["x"] = 2
     assert rhmc(*words) == (2, "", "")
 
@@ -364,7 +364,7 @@ def test_report_hands_on_its_options(
     rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch, options: list[str], given: tuple[object, ...]
 ) -> None:
     calls: list[tuple[object, ...]] = []
-    build = SimpleNamespace(write_report=lambda *given: calls.append(given[:4]) or 2)
+    build = SimpleNamespace(write_report=lambda *given: calls.append(given[:4]) or "refused")
     monkeypatch.setitem(sys.modules, "reports.pages.build", build)
     assert rhmc("report", *options).code == 2
     assert calls == [given]

@@ -110,7 +110,7 @@ CASES = [
     ),
     Case(
         "report --profile paper --study studies/x.yaml --variant large --runs r --out o",
-        {"reports.pages.build.write_report": 0},
+        {"reports.pages.build.write_report": "whole"},
         ("write_report(r, o, paper, x@large, visible_lines)",),
     ),
     Case("methods --out o", {"pipelines.export.methods.export_methods": ""}, ("export_methods(o)",)),

@@ -176,7 +176,7 @@ def test_the_page_is_made_where_it_is_missing_or_old(clone: Path) -> None:
     assert repro(clone).calls == ["report --profile quick"]
 
 
-@pytest.mark.parametrize(("verdict", "code"), [(0, 0), (1, 0), (2, 2)])
+@pytest.mark.parametrize(("verdict", "code"), [(0, 0), (4, 0), (1, 2), (2, 2)])
 def test_the_last_line_is_on_the_published_results(clone: Path, verdict: int, code: int) -> None:
     assert repro(clone).last.startswith("MLflow UI: ")
     (clone / "results" / "published" / "quick").mkdir(parents=True)

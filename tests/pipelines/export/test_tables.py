@@ -192,7 +192,7 @@ def test_the_hours_of_a_study_follow_the_pace_of_finished_runs(tracker: MemoryTr
     assert estimated(study, tmp_path) == ""
 
 
-@pytest.mark.parametrize(("done", "code"), [(1, 1), (2, 0)])
+@pytest.mark.parametrize(("done", "code"), [(1, 3), (2, 0)])
 def test_half_a_study_is_written_and_has_its_exit_code(
     done: int,
     code: int,
@@ -211,7 +211,7 @@ def test_half_a_study_is_written_and_has_its_exit_code(
 
 
 def test_nothing_logged_yet(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert export_study(tiny(), tmp_path / "out", tmp_path / "none") == 1
+    assert export_study(tiny(), tmp_path / "out", tmp_path / "none") == 3
     assert "2 of 2 runs are not finished" in capsys.readouterr().err
     values, table = read(tmp_path / "out")
     assert (list(values), len(values)) == (METRICS.names, 0)
