@@ -95,7 +95,7 @@ def test_what_is_published_by_the_command_is_equal_to_what_it_is_of(exported: Pa
     assert verify("--runs", exported) == (0, "byte-equal to the published quick results: 2 arms\n")
     moved = verify("--runs", edited(exported, tmp_path / "a", 3.0, "fast"))
     assert (moved.code, moved.text.splitlines()[-1]) == (
-        1,
+        4,
         "against the published quick results: 1 arm not shown to be equivalent, 1 arm byte-equal",
     )
 
