@@ -94,7 +94,7 @@ class Recorder:
             copy_run(self.tracker, self.study, source, item, points, {"reused_from": source}, self.board.say)
             self.overview.points(item.card.arm, item.key, points)
             self.overview.ended(item.card.arm, item.key, "finished")
-            self.board.say(f"{item.name}: the same training was finished before; copied")
+            self.board.end(item.name, "the same training was finished before; copied", "finished")
 
     def todo(self) -> list[Item]:
         """One run for each training that is needed and did not fail, in the order of the plan."""
@@ -106,7 +106,7 @@ class Recorder:
         self.arms[key] = item.card.arm
         self.logs[key] = self.tracker.start(item.card)
         self.logs[key].text(CONFIG, resolved_yaml(item, self.study))
-        self.board.start(item.name, item.spec.trainer.steps, self._reached(item))
+        self.board.start(item.name, item.spec.trainer.steps, self._reached(item), kind_of(item))
 
     def _reached(self, item: Item) -> int:
         """Environment steps at the newest checkpoint, 0 without one."""
@@ -140,7 +140,7 @@ class Recorder:
         log, items, folder = self.logs[key], self.waiting[key], self.home.checkpoints(key)
         keep(log, folder, items[0].name, self.board.say)
         self._end(key, "finished")
-        self.board.end(items[0].name, "finished")
+        self.board.end(items[0].name, "finished", "finished")
         self._copy(log.ref, items[1:])
         del self.waiting[key]  # now that nothing of it can fail any more
         Checkpoints(folder).clear()
@@ -171,11 +171,16 @@ class Recorder:
         log.tag("error", error)
         log.text("error.txt", trace)
         self._end(key, "failed")
-        self.board.end(item.name, f"failed: {error}")
+        self.board.end(item.name, f"failed: {error}", "failed")
 
     def _end(self, key: str, status: Status) -> None:
         self.logs.pop(key).finish(status)
         self.overview.ended(self.arms[key], key, status)
+
+
+def kind_of(item: Item) -> str:
+    """Names the runs that train at one pace: of one method in one task."""
+    return f"{item.card.algorithm} in {item.card.task}"
 
 
 def copy_run(

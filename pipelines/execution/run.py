@@ -14,7 +14,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, NamedTuple, Self
 
 from pipelines.execution.joint_recorder import Recorders
-from pipelines.execution.progress import Board, board, print_table
+from pipelines.execution.progress import STARTS, Board, board, print_table
 from pipelines.execution.ray_settings import set_up_ray
 from pipelines.execution.recorder import Recorder
 from pipelines.specs.limits import absent
@@ -222,6 +222,7 @@ def train(studies: Sequence[Study], recorders: Recorders, home: Home, interrupts
         StoreError: the log failed, or Ray cannot be reached.
         KeyboardInterrupt: interrupted a second time, before every run had saved itself.
     """
+    recorders.board.say(STARTS)
     set_up_ray()
     from pipelines.execution.ray_driver import fit, ray_session  # 3 s
 
@@ -249,6 +250,7 @@ def train(studies: Sequence[Study], recorders: Recorders, home: Home, interrupts
         with session as remarks, interrupts.go_to(stop):
             for remark in remarks:
                 recorders.board.say(remark)
+            recorders.board.expect(recorders.tally(resources.concurrent))
             fit(jobs, recorders, scratch, resources.concurrent, resources.cpus, stop)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)

@@ -17,9 +17,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from ruamel.yaml import YAML
 
-from pipelines.execution.progress import Board, StopFile, board, print_table
+from pipelines.execution.progress import STARTS, Board, StopFile, board, print_table
 from pipelines.execution.ray_settings import set_up_ray
 from pipelines.execution.run import Interrupts, guarded, missing_devices
+from pipelines.execution.tally import Ended, Tally, Training
 from pipelines.specs.search import Search
 from pipelines.specs.source_file import another, remember
 from pipelines.tracking.plan import read_commit
@@ -136,6 +137,7 @@ def _clear(search: Search, arm_study: ArmStudy, home: Home) -> None:
 def _train(
     search: Search, arm_studies: Sequence[ArmStudy], trial_log: "TrialLog", home: Home, interrupts: Interrupts
 ) -> None:
+    trial_log.board.say(STARTS)
     set_up_ray()
     from pipelines.execution.ray_driver import ray_session  # 3 s
     from pipelines.tuning.ray_workers import Pool
@@ -150,9 +152,17 @@ def _train(
         with session as remarks, interrupts.go_to(stop):
             for remark in remarks:
                 trial_log.board.say(remark)
+            trial_log.board.expect(tally(search, arm_studies))
             Drive(search, arm_studies, Pool(resources.concurrent, resources.cpus), trial_log, home, stop).run()
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+
+
+def tally(search: Search, arm_studies: Sequence[ArmStudy]) -> Tally:
+    """All trials of all arms, as they are now."""
+    closed = sum(arm_study.closed for arm_study in arm_studies)
+    waiting = [Training(one.arm, search.steps) for one in arm_studies for _ in range(one.left)]
+    return Tally(len(arm_studies) * search.trials, closed, waiting, search.resources.concurrent, "trials")
 
 
 @dataclass
@@ -304,7 +314,7 @@ class TrialLog:
         log = self.logs[card.key] = self.tracker.start(card)
         log.tag("trial", str(request.trial_index))
         log.text("config.yaml", self._yaml(request, card))
-        self.board.start(self._name(request), self.search.steps)
+        self.board.start(self._name(request), self.search.steps, kind=request.arm)
         return card.key
 
     def _yaml(self, request: TrialRequest, card: Card) -> str:
@@ -327,13 +337,13 @@ class TrialLog:
     def complete(self, key: str, request: TrialRequest, step: float, value: float) -> None:
         """A trial ended: its value is the metric `objective`, which a pruned one has not."""
         self.logs[key].log([{"step": step, "objective": value}])
-        self._end(key, request, "complete", "finished", f"objective {value:.2f}")
+        self._end(key, request, "complete", "finished", f"objective {value:.2f}", "finished")
 
     def prune(self, key: str, request: TrialRequest, why: str, status: Status) -> None:
         """A trial is given up."""
         if status == "failed":
             self.logs[key].tag("error", why)
-        self._end(key, request, "pruned", status, f"pruned, {why}")
+        self._end(key, request, "pruned", status, f"pruned, {why}", "finished")
 
     def interrupt(self, key: str, request: TrialRequest) -> None:
         """A trial saved itself for the next launch."""
@@ -347,13 +357,15 @@ class TrialLog:
         """A trial raised: keep why, go on with the others."""
         self.logs[key].tag("error", error)
         self.logs[key].text("error.txt", trace)
-        self._end(key, request, "failed", "failed", f"failed: {error}")
+        self._end(key, request, "failed", "failed", f"failed: {error}", "failed")
 
-    def _end(self, key: str, request: TrialRequest, state: str, status: Status, text: str) -> None:
+    def _end(
+        self, key: str, request: TrialRequest, state: str, status: Status, text: str, ended: Ended = "waiting"
+    ) -> None:
         log = self.logs.pop(key)
         log.tag("state", state)
         log.finish(status)
-        self.board.end(self._name(request), text)
+        self.board.end(self._name(request), text, ended)
 
     def _name(self, request: TrialRequest) -> str:
         return f"{self.search.name} / {request.name}"
