@@ -37,7 +37,7 @@ from pipelines.tuning import ray_workers
 from pipelines.tuning.best_params import file_name, winner_yaml
 from pipelines.tuning.ray_workers import Failed
 from pipelines.tuning.search_plots import plots
-from pipelines.tuning.search_run import Drive, TrialLog, results, run_search, search_card, show_search
+from pipelines.tuning.search_run import Drive, TrialLog, results, run_search, search_card, show_search, tally
 from pipelines.tuning.trials import ArmStudy, look, open_storage
 from pipelines.workspace.work_folder import Home, StoreError
 from rhmc.training.trainer import Trainer
@@ -433,6 +433,23 @@ def test_every_arm_is_tried_as_often_and_all_advance_together(tmp_path: Path) ->
     assert all({"IQL", "VDN"} == set(order[k : k + 2]) for k in range(0, 10, 2))
     assert {arm_study.left for arm_study in world.arm_studies()} == {0}
     assert world.launch().trained == 0
+
+
+def test_the_board_counts_the_trials_of_all_arms(tmp_path: Path) -> None:
+    world, queue = World(load(), tmp_path), []
+    make = TrialLog.__init__
+
+    def counted(self: TrialLog, search: Search, tracker: Any, display: Any) -> None:
+        make(self, search, tracker, display)
+        queue.append(tally(search, world.arm_studies()))
+        display.expect(queue[-1])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(TrialLog, "__init__", counted)
+        world.launch(size=2)
+    assert world.out.getvalue().splitlines()[0] == "0 of 10 trials finished"
+    assert (str(queue[0]), queue[0].left()) == ("10 of 10 trials finished", 0)
+    assert str(tally(world.search, world.arm_studies())) == "10 of 10 trials finished"
 
 
 def test_a_trial_is_judged_by_the_mean_of_its_seeds(tmp_path: Path) -> None:
