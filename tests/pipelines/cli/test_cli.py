@@ -370,6 +370,19 @@ def test_report_hands_on_its_options(
     assert calls == [given]
 
 
+def test_the_verdicts_are_counted_and_the_page_is_a_link(rhmc: Rhmc, tmp_path: Path) -> None:
+    said = rhmc("verdicts")
+    assert (said.code, said.err) == (2, "results/quick/claims.json: no such file; `rhmc report` writes it\n")
+    folder = tmp_path / "a b"
+    folder.mkdir()
+    (folder / "claims.json").write_text('[{"verdict": "yes"}, {"verdict": "no"}, {"verdict": "yes"}]')
+    said = rhmc("verdicts", "--out", str(folder))
+    page = f"file://{tmp_path}/a%20b/index.html"
+    assert said == (0, f"Verdicts:  3 claims: 2 yes, 1 no\nReport:    {page}\n", "")
+    (folder / "claims.json").write_text('["yes"]')
+    assert rhmc("verdicts", "--out", str(folder)).code == 2
+
+
 # Yardsticks
 
 
