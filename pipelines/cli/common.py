@@ -4,7 +4,7 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
@@ -41,12 +41,49 @@ def _profiles(incomplete: str) -> list[str]:
     return [name for name in PROFILES if name.startswith(incomplete)]
 
 
+def _given(ctx: typer.Context) -> list[Path]:
+    """The files on a command line that is being completed."""
+    values = ctx.params.get("files") or [ctx.params.get("file") or ctx.params.get("what")]
+    return [Path(str(value)) for value in values if value]
+
+
+def _names(ctx: typer.Context, group: str, incomplete: str) -> list[str]:
+    """The keys of a mapping in these files."""
+    from pipelines.specs.document import read
+
+    roots = [root for file in _given(ctx) if (root := read(file)[0])]
+    names = dict.fromkeys(name for root in roots if group in root.children for name in root.children[group].children)
+    return [name for name in names if name.startswith(incomplete)]
+
+
+def _variants(ctx: typer.Context, incomplete: str) -> list[str]:
+    return _names(ctx, "variants", incomplete)
+
+
+def _arms(ctx: typer.Context, incomplete: str) -> list[str]:
+    """Completion of an arm; those of a grid or of readings have names that only the whole study tells."""
+    if not (_names(ctx, "grid", "") or _names(ctx, "readings", "")):
+        return _names(ctx, "arms", incomplete)
+    profile, variant = ctx.params.get("profile") or "quick", ctx.params.get("variant")
+    with suppress(InputError):
+        studies = load_studies(_given(ctx), profile, ctx.params.get("overrides"), variant)
+        return [arm for study in studies for arm in study.arms if arm.startswith(incomplete)]
+    return []
+
+
 File = Annotated[
     Path, typer.Argument(metavar="FILE", help="A study, such as studies/ablation.yaml.", autocompletion=_studies)
 ]
 Files = Annotated[list[Path], typer.Argument(metavar="FILE...", help="Studies.", autocompletion=_studies)]
 Profile = Annotated[str, typer.Option(help="The budget: quick or paper.", autocompletion=_profiles)]
-Variant = Annotated[str | None, typer.Option(help="One of the file's variants, which changes every arm.")]
+Variant = Annotated[
+    str | None,
+    typer.Option(help="One of the file's variants, which changes every arm.", autocompletion=_variants),
+]
+Arms = Annotated[
+    list[str] | None,
+    typer.Option("--arm", metavar="NAME", help="Only this arm. Can be given several times.", autocompletion=_arms),
+]
 Sets = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help=SET_HELP)]
 Json = Annotated[bool, typer.Option("--json", help="JSON on stdout instead of a table.")]
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pipelines.cli.common import (
+    Arms,
     File,
     Files,
     Json,
@@ -93,16 +94,18 @@ def _show_budget(study: "Study") -> None:
 
 
 @app.command("run")
-def run(files: Files, profile: Profile = "quick", variant: Variant = None, overrides: Sets = None) -> None:
+def run(
+    files: Files, profile: Profile = "quick", variant: Variant = None, arm: Arms = None, overrides: Sets = None
+) -> None:
     """Run what studies still lack. Finished runs are skipped, interrupted ones continue.
 
-    Several files are one queue: what they share is trained once.
+    Several files are one queue: what they share is trained once. With --arm the other arms wait for another launch.
     """
     studies = load_studies(files, profile, overrides, variant)
     from pipelines.execution.run import run_studies
     from pipelines.workspace.work_folder import work_folder
 
-    raise typer.Exit(run_studies(studies, work_folder()))
+    raise typer.Exit(run_studies(studies, work_folder(), arm or ()))
 
 
 @app.command("status")

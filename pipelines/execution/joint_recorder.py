@@ -55,7 +55,7 @@ class Recorders:
 
     def tally(self, at_a_time: int) -> Tally:
         """All runs of all studies, as they are now. at_a_time: trainings side by side."""
-        total, left = (sum(counts) for counts in zip(*((len(one.plan), one.left) for one in self.each), strict=True))
+        total, left = (sum(counts) for counts in zip(*((len(one.wanted), one.left) for one in self.each), strict=True))
         waiting = [Training(kind_of(item), item.spec.trainer.steps) for item in self.todo()]
         tally = Tally(total, total - left, waiting, at_a_time)
         tally.failed = sum(len(one.failures) for one in self.each)

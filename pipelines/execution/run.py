@@ -17,6 +17,7 @@ from pipelines.execution.joint_recorder import Recorders
 from pipelines.execution.progress import STARTS, Board, board, print_table
 from pipelines.execution.ray_settings import set_up_ray
 from pipelines.execution.recorder import Recorder
+from pipelines.specs.document import choices
 from pipelines.specs.limits import absent
 from pipelines.specs.source_file import another, remember
 from pipelines.specs.study import Study
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from pipelines.tracking.mlflow_tracker import MlflowTracker
 
 
-def run_studies(studies: Sequence[Study], home: Path) -> int:
+def run_studies(studies: Sequence[Study], home: Path, arms: Sequence[str] = ()) -> int:
     """Bring studies to their end: skip what is finished, continue what was interrupted, train the rest.
 
     Their runs are one queue, in the order of the studies: no worker is idle while the last run of a study trains, and
@@ -43,9 +44,10 @@ def run_studies(studies: Sequence[Study], home: Path) -> int:
     Args:
         studies: the plans, one or more.
         home: the work folder.
+        arms: names of those that are trained; all if empty.
 
     Returns:
-        0 all finished, 3 some run failed, 2 environment error, 130 interrupted, 143 terminated. A second launch
+        0 all of these are finished, 3 some run failed, 2 environment error, 130 interrupted, 143 terminated. A second launch
         is always safe.
 
     Raises:
@@ -56,8 +58,21 @@ def run_studies(studies: Sequence[Study], home: Path) -> int:
         raise InputError(*faults)
     for remark in (remark for study in studies for remark in study.remarks):
         print(f"note: {remark}", file=sys.stderr)
-    names = [(study.name, study.profile) for study in studies]
-    return guarded(home, names, lambda place, interrupts: _launch(studies, place, interrupts))
+    having = having_arms(studies, arms)
+    names = [(study.name, study.profile) for study in having]
+    return guarded(home, names, lambda place, interrupts: _launch(having, place, interrupts, arms))
+
+
+def having_arms(studies: Sequence[Study], arms: Sequence[str]) -> Sequence[Study]:
+    """The studies that have one of these arms; all where none is named.
+
+    Raises:
+        InputError: no study has such an arm.
+    """
+    known = list(dict.fromkeys(name for study in studies for name in study.arms))
+    if faults := [f"--arm: '{arm}' is not allowed; {choices(arm, known)}" for arm in arms if arm not in known]:
+        raise InputError(*faults)
+    return [study for study in studies if not arms or not study.arms.keys().isdisjoint(arms)]
 
 
 def missing_devices(where: Iterable[tuple[str, str]]) -> Iterator[str]:
@@ -170,7 +185,7 @@ class Launched(NamedTuple):
     recorder: Recorder
 
 
-def _launch(studies: Sequence[Study], home: Home, interrupts: Interrupts) -> int:
+def _launch(studies: Sequence[Study], home: Home, interrupts: Interrupts, arms: Sequence[str]) -> int:
     with board(terminal()) as display, ExitStack() as logs:
         for study in studies:
             if remark := another(home, study.name, study.profile, study.file):
@@ -180,10 +195,10 @@ def _launch(studies: Sequence[Study], home: Home, interrupts: Interrupts) -> int
         if known.why:
             display.say(f"the commit is logged as unknown: {known.why}")
         code = Code(known.name, host())
-        launched = [logs.enter_context(_logged(study, code, home, display)) for study in studies]
+        launched = [logs.enter_context(_logged(study, code, home, display, arms)) for study in studies]
         recorders = Recorders([one.recorder for one in launched])
         if skipped := sum(one.skipped for one in recorders.each):
-            display.say(f"{skipped} of {sum(len(one.plan) for one in recorders.each)} runs were finished before")
+            display.say(f"{skipped} of {sum(len(one.wanted) for one in recorders.each)} runs were finished before")
         left = recorders.reuse()
         while left and not interrupts.came:
             train(studies, recorders, home, interrupts)
@@ -191,12 +206,13 @@ def _launch(studies: Sequence[Study], home: Home, interrupts: Interrupts) -> int
         for one in launched:
             one.recorder.overview.publish()
     _summary(launched)
-    found = {one.recorder.status for one in launched}
-    return Exit.UNFINISHED if "failed" in found else interrupts.code if "interrupted" in found else Exit.DONE
+    if any(one.failures for one in recorders.each):
+        return Exit.UNFINISHED
+    return interrupts.code if any(one.left for one in recorders.each) else Exit.DONE
 
 
 @contextmanager
-def _logged(study: Study, code: Code, home: Home, display: Board) -> Iterator[Launched]:
+def _logged(study: Study, code: Code, home: Home, display: Board, arms: Sequence[str]) -> Iterator[Launched]:
     """A study's log while it is written to; whatever happens, it ends with how far the study came."""
     from pipelines.tracking.mlflow_tracker import MlflowTracker  # 3 s: only when something is launched
 
@@ -206,7 +222,7 @@ def _logged(study: Study, code: Code, home: Home, display: Board) -> Iterator[La
     try:
         for remark in tracker.remarks:
             display.say(f"{study.name}: {remark}")
-        recorder = Recorder(card, items(study, *code), tracker, home, display)
+        recorder = Recorder(card, items(study, *code), tracker, home, display, arms)
         yield Launched(study, tracker, recorder)
     finally:
         tracker.close(recorder.status if recorder else "interrupted")
@@ -276,7 +292,7 @@ def _summary(launched: Sequence[Launched]) -> None:
     for one in launched:
         for name, error in one.recorder.failures.items():
             console.print(visible(f"failed: {name}: {error}"), soft_wrap=True)
-    tracker, left = launched[0].tracker, any(one.recorder.left for one in launched)
+    tracker, left = launched[0].tracker, any(one.recorder.left or one.recorder.later for one in launched)
     experiments = ", ".join(repr(one.tracker.name) for one in launched)
     lines = [
         f"look:  {tracker.where()}",
