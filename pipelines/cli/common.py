@@ -1,12 +1,13 @@
 """Parts that the verbs share: options, reading a study, printing. Imports nothing heavy."""
 
 import json
+import os
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
 
@@ -14,9 +15,11 @@ from pipelines.specs.safe_names import PROFILES
 from pipelines.workspace.errors import InputError, visible, visible_lines
 
 if TYPE_CHECKING:
+    from pipelines.specs.document import Node
     from pipelines.specs.study import Study
 
 Loaded = TypeVar("Loaded")
+Kind = Literal["study", "search"]
 WIDTH = 140  # columns of a table that is not shown on a terminal
 
 SET_HELP = (
@@ -85,7 +88,59 @@ Arms = Annotated[
     typer.Option("--arm", metavar="NAME", help="Only this arm. Can be given several times.", autocompletion=_arms),
 ]
 Sets = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help=SET_HELP)]
+Folder = Annotated[Path | None, typer.Option(help="Where the files are; studies if not given.")]
 Json = Annotated[bool, typer.Option("--json", help="JSON on stdout instead of a table.")]
+
+
+def studies_folder(folder: Path | None) -> Path:
+    """The folder of studies: the given one, else `studies` here, else that of the project around."""
+    from pipelines.workspace.root import project
+
+    if folder is not None or Path("studies").is_dir():
+        return folder or Path("studies")
+    return Path(os.path.relpath(project() / "studies"))
+
+
+def files_of_kind(folder: Path, kind: Kind) -> list[tuple[Path, "Node | None", list[Any]]]:
+    """The studies or the searches in a folder, with what was read and its faults. A file that is neither is a study.
+
+    Raises:
+        InputError: there is no such file.
+    """
+    from pipelines.specs.document import read
+
+    with suppress(FileNotFoundError):
+        folder.stat()  # a name that cannot be looked at: from Python 3.13 on `glob` passes over it
+    files = sorted(folder.glob("*.yaml"))
+    found = [(file, *read(file)) for file in files]
+    wanted = [(file, root, faults) for file, root, faults in found if kind_of(root) == kind]
+    if not (wanted if kind == "search" else files):
+        words = "studies (*.yaml)" if kind == "study" else "searches (an arm has a space)"
+        raise InputError(f"{folder}: no {words} here; `rhmc study copy NAME` writes one of this package")
+    return wanted
+
+
+def kind_of(root: "Node | None") -> Kind:
+    """A search has a space in an arm."""
+    arms = root.children.get("arms") if root else None
+    return "search" if arms and any("space" in arm.children for arm in arms.children.values()) else "study"
+
+
+def listing(folder: Path | None, kind: Kind, as_json: bool) -> None:
+    """List what is in a folder with its questions, and the variants of studies or the arms of searches."""
+    group = "variants" if kind == "study" else "arms"
+    found: list[dict[str, Any]] = []
+    for file, root, faults in files_of_kind(studies_folder(folder), kind):
+        nodes = root.children if root else {}
+        question = " ".join(str(nodes["question"].value).split()) if "question" in nodes else ""
+        fault = "" if question else str(faults[0]) if faults else "no question"
+        names = list(nodes[group].children) if group in nodes else []
+        found.append({kind: str(file), "question": question, group: names, "fault": fault})
+    if as_json:
+        say_json(found)
+        return
+    rows = [[one[kind], one["question"] or one["fault"], ", ".join(one[group])] for one in found]
+    table([kind, "question", group], rows)
 
 
 def load_study(file: Path, profile: str, overrides: Sequence[str] | None, variant: str | None) -> "Study":

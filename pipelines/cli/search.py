@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipelines.cli.common import Profile, files_in, folder_option, load_each, say, tell
+from pipelines.cli.common import Folder, Json, Profile, files_in, folder_option, listing, load_each, say, tell
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.exit_codes import Exit
 
@@ -39,6 +39,8 @@ app = typer.Typer(help="Search settings with the same budget for every method.",
 @app.command("check")
 def check(file: File, profile: Profile = "quick", overrides: Sets = None) -> None:
     """Say what a search would try, or everything that is wrong with it. Starts nothing."""
+    from pipelines.export.pace import estimated_search
+
     search = _search(file, profile, overrides)
     say(f"{search.name} ({search.profile}): {search.question}")
     for name, arm in search.arms.items():
@@ -49,6 +51,8 @@ def check(file: File, profile: Profile = "quick", overrides: Sets = None) -> Non
         f"{each * search.steps:,} in all; sampler {search.sampler.kind}, pruner {search.pruner.kind}, "
         f"{search.resources.concurrent} trials at a time"
     )
+    if hours := estimated_search(search, Path("results") / search.profile / "runs"):
+        say(hours)
     for remark in search.remarks:
         say(f"note: {remark}")
 
@@ -72,6 +76,12 @@ def status(file: File, profile: Profile = "quick", overrides: Sets = None) -> No
     from pipelines.workspace.work_folder import work_folder
 
     raise typer.Exit(show_search(search, work_folder()))
+
+
+@app.command("list")
+def list_(folder: Folder = None, as_json: Json = False) -> None:
+    """List the searches of a folder with their questions and arms."""
+    listing(folder, "search", as_json)
 
 
 @app.command("export")

@@ -2,9 +2,8 @@
 
 import shlex
 import sys
-from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,14 +11,15 @@ from pipelines.cli.common import (
     Arms,
     File,
     Files,
+    Folder,
     Json,
     Profile,
     Sets,
     Variant,
+    listing,
     load_studies,
     load_study,
     say,
-    say_json,
     table,
     tell,
 )
@@ -121,35 +121,9 @@ def status(
 
 
 @app.command("list")
-def list_(
-    folder: Annotated[Path, typer.Option(help="Where the studies are.")] = Path("studies"), as_json: Json = False
-) -> None:
-    """List the studies of a folder with their questions and variants."""
-    with suppress(FileNotFoundError):
-        folder.stat()  # a name that cannot be looked at: from Python 3.13 on `glob` passes over it
-    files = sorted(folder.glob("*.yaml"))
-    if not files:
-        raise InputError(f"{folder}: no studies (*.yaml) here; `rhmc study copy NAME` writes one of this package")
-    found = [one for file in files if (one := _listed(file))]
-    if as_json:
-        say_json(found)
-        return
-    rows = [[one["study"], one["question"] or one["fault"], ", ".join(one["variants"])] for one in found]
-    table(["study", "question", "variants"], rows)
-
-
-def _listed(file: Path) -> dict[str, Any] | None:
-    """The listing of a study; None for a search, which has a space in an arm."""
-    from pipelines.specs.document import read
-
-    root, faults = read(file)
-    nodes = root.children if root else {}
-    if "arms" in nodes and any("space" in arm.children for arm in nodes["arms"].children.values()):
-        return None
-    question = " ".join(str(nodes["question"].value).split()) if "question" in nodes else ""
-    fault = "" if question else str(faults[0]) if faults else "no question"
-    variants = list(nodes["variants"].children) if "variants" in nodes else []
-    return {"study": str(file), "question": question, "variants": variants, "fault": fault}
+def list_(folder: Folder = None, as_json: Json = False) -> None:
+    """List the studies of a folder with their questions and variants. `rhmc search list` has the searches."""
+    listing(folder, "study", as_json)
 
 
 @app.command("copy")

@@ -60,10 +60,10 @@ class Timer:
     def __init__(self) -> None:
         self.began = self.shown = time.monotonic()
 
-    def due(self) -> bool:
-        """True if it is time for a line, which then counts as shown."""
+    def due(self, *, news: bool = False) -> bool:
+        """True if it is time for a line, which then counts as shown. news: it need not wait longer than at first."""
         now = time.monotonic()
-        if now - self.shown < min(max(EVERY, SHARE * (now - self.began)), SELDOM):
+        if now - self.shown < (EVERY if news else min(max(EVERY, SHARE * (now - self.began)), SELDOM)):
             return False
         self.shown = now
         return True
@@ -223,10 +223,10 @@ class PlainBoard:
         self.say(f"{name}: {outcome}{score}")
         if self.tally:
             self.tally.end(name, ended)
-            self._all(self.tally)
+            self._all(self.tally, news=True)
 
-    def _all(self, tally: Tally) -> None:
-        if self.timer.due():
+    def _all(self, tally: Tally, *, news: bool = False) -> None:
+        if self.timer.due(news=news):
             self.say(for_all(tally))
 
     def say(self, text: str) -> None:

@@ -47,8 +47,8 @@ def run_studies(studies: Sequence[Study], home: Path, arms: Sequence[str] = ()) 
         arms: names of those that are trained; all if empty.
 
     Returns:
-        0 all of these are finished, 3 some run failed, 2 environment error, 130 interrupted, 143 terminated. A second launch
-        is always safe.
+        0 all of these are finished, 3 some run failed, 2 environment error, 130 interrupted, 143 terminated. A second
+        launch is always safe.
 
     Raises:
         InputError: the studies cannot be launched together.

@@ -18,6 +18,7 @@ from filelock import BaseFileLock, FileLock, Timeout
 from pipelines.workspace.addresses import scrubbed
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.leftovers import part_of, remove
+from pipelines.workspace.root import project
 from rhmc.types import State
 
 GLANCE = 0.5  # seconds that another process may hold a study's lock only to see whether it is free
@@ -38,12 +39,12 @@ class DamagedError(StoreError):
 
 
 def work_folder() -> Path:
-    """`$RHMC_HOME`, with `~` as a shell understands it, or `work` in the current folder.
+    """`$RHMC_HOME`, with `~` as a shell understands it, or `work` at the top of the checkout, else in this folder.
 
     Raises:
         StoreError: it is no path that the files of a database can have.
     """
-    name = os.path.expanduser(os.environ.get("RHMC_HOME") or "work")
+    name = os.path.expanduser(os.environ.get("RHMC_HOME") or project() / "work")
     try:
         name.encode()
         return _followed(Path(name))

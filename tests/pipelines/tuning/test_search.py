@@ -278,10 +278,14 @@ def test_arms_may_include_one_space() -> None:
 
 def test_a_study_is_no_search_and_a_search_no_study() -> None:
     load()
-    with pytest.raises(StudyError, match=r"^studies/search_x.yaml:1:1: an arm has a space: a search, .* is no study$"):
+    with pytest.raises(
+        StudyError,
+        match=r"^studies/search_x.yaml:1:1: .*: a search, for `rhmc search check`, .* is no study$",
+    ):
         Study.load("studies/search_x.yaml")
     with pytest.raises(
-        StudyError, match=r"coverage.yaml:1:1: no arm has a space: a study, for `rhmc study`, is no search$"
+        StudyError,
+        match=r"coverage.yaml:1:1: no arm has a space: a study, for `rhmc study check`, .* is no search$",
     ):
         Search.load(ROOT / "studies" / "coverage.yaml")
 
