@@ -101,11 +101,11 @@ def studies_folder(folder: Path | None) -> Path:
     return Path(os.path.relpath(project() / "studies"))
 
 
-def files_of_kind(folder: Path, kind: Kind) -> list[tuple[Path, "Node | None", list[Any]]]:
+def files_of_kind(folder: Path, kind: Kind, *, optional: bool = False) -> list[tuple[Path, "Node | None", list[Any]]]:
     """The studies or the searches in a folder, with what was read and its faults. A file that is neither is a study.
 
     Raises:
-        InputError: there is no such file.
+        InputError: there is no such file, and it is not `optional`.
     """
     from pipelines.specs.document import read
 
@@ -114,7 +114,7 @@ def files_of_kind(folder: Path, kind: Kind) -> list[tuple[Path, "Node | None", l
     files = sorted(folder.glob("*.yaml"))
     found = [(file, *read(file)) for file in files]
     wanted = [(file, root, faults) for file, root, faults in found if kind_of(root) == kind]
-    if not (wanted if kind == "search" else files):
+    if not optional and not (wanted if kind == "search" else files):
         words = "studies (*.yaml)" if kind == "study" else "searches (an arm has a space)"
         raise InputError(f"{folder}: no {words} here; `rhmc study copy NAME` writes one of this package")
     return wanted

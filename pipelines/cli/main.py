@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from pipelines.cli import doctor, evaluate, render, science, search, study, ui, verify, yardsticks
+from pipelines.cli import doctor, evaluate, render, science, search, status, study, ui, verify, yardsticks
 from pipelines.workspace import streams
 from pipelines.workspace.addresses import reach_loopback, scrubbed
 from pipelines.workspace.errors import InputError, visible
@@ -83,6 +83,7 @@ def options(
 app.add_typer(study.app, name="study")
 app.add_typer(search.app, name="search")
 app.add_typer(yardsticks.app, name="yardsticks")
+app.command("status", rich_help_panel=RESULTS)(status.status)
 app.command("evaluate", rich_help_panel=RESULTS)(evaluate.evaluate)
 app.command("transfer", rich_help_panel=RESULTS)(evaluate.transfer)
 app.command("assignments", rich_help_panel=RESULTS)(evaluate.assignments)

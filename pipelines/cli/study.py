@@ -113,11 +113,16 @@ def status(
     file: File, profile: Profile = "quick", variant: Variant = None, as_json: Json = False, overrides: Sets = None
 ) -> None:
     """Say how many runs are finished, under way, missing or stale (made by other code). Exit code 3 if any is left."""
-    study = load_study(file, profile, overrides, variant)
-    from pipelines.execution.run import show_status
+    from pipelines.execution.standing import show_quickly
     from pipelines.workspace.work_folder import work_folder
 
-    raise typer.Exit(show_status(study, work_folder(), as_json=as_json))
+    code = show_quickly(file, profile, variant, overrides or (), work_folder(), as_json=as_json)
+    if code is None:
+        study = load_study(file, profile, overrides, variant)
+        from pipelines.execution.run import show_status
+
+        code = show_status(study, work_folder(), as_json=as_json)
+    raise typer.Exit(code)
 
 
 @app.command("list")

@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Protocol, Self
+from typing import TYPE_CHECKING, Protocol, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
@@ -19,7 +19,9 @@ from rich.text import Text
 from pipelines.execution.tally import Ended, Tally, Training
 from pipelines.workspace.best_effort import decoration
 from pipelines.workspace.errors import visible
-from rhmc.types import Metrics
+
+if TYPE_CHECKING:
+    from rhmc.types import Metrics
 
 EVERY, SELDOM = 10.0, 600.0  # seconds between two plain lines of a run, or of all: the least, and the most
 SHARE = 0.1  # of what has passed since the first: an hour's run does not fill the log
@@ -37,7 +39,7 @@ class Line:
     score: float = float("nan")  # last return
     timer: "Timer" = field(default_factory=lambda: Timer())
 
-    def take(self, point: Metrics) -> None:
+    def take(self, point: "Metrics") -> None:
         """Read a new point."""
         self.step = int(point["step"])
         self.score = point.get("final/return", point.get("eval/return", self.score))
@@ -106,7 +108,7 @@ class Board(Protocol):
         """A run begins, or continues where it has `reached`; `total` environment steps. kind: see `Training`."""
         ...
 
-    def points(self, name: str, points: list[Metrics]) -> None:
+    def points(self, name: str, points: "list[Metrics]") -> None:
         """A run got further."""
         ...
 
@@ -149,7 +151,7 @@ class SafeBoard:
         """See `Board`."""
         self._pass(lambda inner: inner.start(name, total, reached, kind))
 
-    def points(self, name: str, points: list[Metrics]) -> None:
+    def points(self, name: str, points: "list[Metrics]") -> None:
         """See `Board`."""
         self._pass(lambda inner: inner.points(name, points))
 
@@ -205,7 +207,7 @@ class PlainBoard:
             self.tally.start(name, Training(kind, total), reached)
         self.say(f"{name}: {began(reached, total)}")
 
-    def points(self, name: str, points: list[Metrics]) -> None:
+    def points(self, name: str, points: "list[Metrics]") -> None:
         """See `Board`."""
         line = self.lines[name]
         for point in points:
@@ -288,7 +290,7 @@ class LiveBoard:
             self.tally.start(name, Training(kind, total), reached)
         self._all()
 
-    def points(self, name: str, points: list[Metrics]) -> None:
+    def points(self, name: str, points: "list[Metrics]") -> None:
         """See `Board`."""
         line, task = self.lines[name]
         for point in points:

@@ -1,6 +1,5 @@
 """Launch studies: what their plans still lack goes through Ray Tune, results go to the log as they come."""
 
-import json
 import os
 import shlex
 import shutil
@@ -17,10 +16,12 @@ from pipelines.execution.joint_recorder import Recorders
 from pipelines.execution.progress import STARTS, Board, board, print_table
 from pipelines.execution.ray_settings import set_up_ray
 from pipelines.execution.recorder import Recorder
+from pipelines.execution.standing import Standing, by_arm, counted, show
 from pipelines.specs.document import choices
 from pipelines.specs.limits import absent
 from pipelines.specs.source_file import another, remember
 from pipelines.specs.study import Study
+from pipelines.tracking.kept_plan import KeptPlan, Options, Place, keep
 from pipelines.tracking.plan import Item, finished, given_twice, items, read_commit, study_card
 from pipelines.tracking.staleness import stale_lines, stale_runs
 from pipelines.tracking.tracker import Tracker
@@ -222,7 +223,12 @@ def _logged(study: Study, code: Code, home: Home, display: Board, arms: Sequence
     try:
         for remark in tracker.remarks:
             display.say(f"{study.name}: {remark}")
-        recorder = Recorder(card, items(study, *code), tracker, home, display, arms)
+        plan = items(study, *code)
+        recorder = Recorder(card, plan, tracker, home, display, arms)
+        if study.file:
+            options = Options(study.file, study.profile, study.variant, study.overrides)
+            runs = {item.name: Place(item.card.arm, item.key) for item in plan}
+            keep(home, options, KeptPlan(study.name, runs, list(study.remarks)))
         yield Launched(study, tracker, recorder)
     finally:
         tracker.close(recorder.status if recorder else "interrupted")
@@ -314,10 +320,11 @@ def _arguments(studies: Sequence[Study]) -> str:
 
 def _arms(plan: list[Item], tracker: Tracker) -> list[list[str]]:
     refs = {(run.arm, run.key): run.ref for run in tracker.recorded() if run.status == "finished"}
-    there = [refs[place] for arm in _by_arm(plan).values() for place in arm if place in refs]
+    arms = by_arm(_places(plan))
+    there = [refs[place] for places in arms.values() for place in places if place in refs]
     scores = {row.ref: row.value for row in tracker.rows(there, {SCORE})}
     table = []
-    for arm, places in _by_arm(plan).items():
+    for arm, places in arms.items():
         done = [refs[place] for place in places if place in refs]
         values = [scores[ref] for ref in done if ref in scores]
         mean = f"{sum(values) / len(values):.2f}" if values else "-"
@@ -325,16 +332,11 @@ def _arms(plan: list[Item], tracker: Tracker) -> list[list[str]]:
     return table
 
 
-def _by_arm(plan: list[Item]) -> dict[str, list[tuple[str, str]]]:
-    """The planned runs of each arm, as arm and key; what is planned twice once."""
-    arms: dict[str, dict[tuple[str, str], None]] = {}
-    for item in plan:
-        arms.setdefault(item.card.arm, {})[item.card.arm, item.key] = None
-    return {arm: list(places) for arm, places in arms.items()}
+def _places(plan: Iterable[Item]) -> list[Place]:
+    return [Place(item.card.arm, item.key) for item in plan]
 
 
 SCORE = "final/return"
-STATES = ("finished", "running", "interrupted", "failed", "missing")
 
 
 def show_status(study: Study, home: Path, *, as_json: bool = False) -> int:
@@ -344,49 +346,33 @@ def show_status(study: Study, home: Path, *, as_json: bool = False) -> int:
         0 all finished, 3 not, 2 environment error.
     """
     try:
-        found = _status(study, Home(home))
+        found = standing_of(study, Home(home))
     except StoreError as error:
         print(f"rhmc: {error}", file=sys.stderr)
         return Exit.BAD
-    if as_json:
-        print(json.dumps({"study": study.name, "profile": study.profile} | found._asdict()))
-    else:
-        columns = ["planned", *STATES, "stale"]
-        rows = [[arm, *(str(one[c]) for c in columns)] for arm, one in found.arms.items()]
-        print_table(terminal(), ["arm", *columns], rows)
-        lines = [f"failed: {name}: {error}" for name, error in found.errors.items()]
-        lines += [*found.stale, *(f"note: {remark}" for remark in (*study.remarks, *found.remarks))]
-        terminal().print("\n".join(map(visible, lines)), soft_wrap=True, end="\n" if lines else "")
-    return Exit.DONE if found.finished else Exit.UNFINISHED
+    return show(study.name, study.profile, found, study.remarks, as_json=as_json)
 
 
-class Standing(NamedTuple):
-    """The progress of a study."""
+def standing_of(study: Study, home: Home) -> Standing:
+    """The progress of a study.
 
-    finished: bool  # all of it
-    arms: dict[str, dict[str, int]]  # runs by state
-    errors: dict[str, str]  # of each failed run, by its name
-    stale: list[str]  # why runs are no part of the plan, a line for each arm and reason
-    remarks: list[str]  # of the log
+    Raises:
+        StoreError: the log cannot be read.
+    """
+    tracker = None
+    if os.environ.get("MLFLOW_TRACKING_URI") or home.database.exists():
+        from pipelines.tracking.mlflow_tracker import open_existing  # 3 s: only where there may be a log
 
-
-def _status(study: Study, home: Home) -> Standing:
-    from pipelines.tracking.mlflow_tracker import open_existing
-
-    tracker = open_existing(study_card(study), home)
+        tracker = open_existing(study_card(study), home)
     recorded = tracker.recorded() if tracker else []
     plan = items(study)
     # Runs of a driver that was killed are logged as running; a log in this folder knows no other driver than one here.
     own = tracker is not None and tracker.own
     seen = {"running": "interrupted"} if own and not home.driven(study.name, study.profile) else {}
-    state = {(run.arm, run.key): seen.get(run.status, run.status) for run in recorded}
+    state = {Place(run.arm, run.key): seen.get(run.status, run.status) for run in recorded}
     planned = {(item.card.arm, item.key) for item in plan}
     others = stale_runs(plan, recorded, tracker) if tracker else []
-    of_arm = Counter(arm for arm, _ in others)
-    arms = {}
-    for arm, places in _by_arm(plan).items():
-        mine = Counter(state.get(place, "missing") for place in places)
-        arms[arm] = {"planned": len(places)} | {kind: mine[kind] for kind in STATES} | {"stale": of_arm[arm]}
+    arms = counted(_places(plan), state, Counter(arm for arm, _ in others))
     failed = {(run.arm, run.key): run.error for run in recorded if run.status == "failed"}
     errors = {item.name: failed[item.card.arm, item.key] for item in plan if (item.card.arm, item.key) in failed}
     return Standing(

@@ -485,6 +485,26 @@ def _short(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
+def standing_of(search: Search, place: Home) -> dict[str, int]:
+    """The trials of all arms by state, closed ones as `finished`, with `planned` and `stale`.
+
+    Raises:
+        StoreError: the database cannot be read.
+    """
+    found = dict.fromkeys(("finished", "running", "failed", "missing", "stale"), 0)
+    found["planned"] = search.trials * len(search.arms)
+    with opened(place, write=False) as storage, explained(storage_url(place)):
+        if storage is None:
+            return found | {"missing": found["planned"]}
+        for arm in search.arms:
+            arm_study, stale = look(search, arm, storage)
+            counts = arm_study.counts()
+            running = counts["running"] if place.driven(search.name, search.profile) else 0
+            mine = {"finished": arm_study.closed, "running": running, "failed": counts["failed"], "stale": stale}
+            found |= {name: found[name] + count for name, count in (mine | {"missing": counts["missing"]}).items()}
+    return found
+
+
 def show_search(search: Search, home: Path) -> int:
     """Print how far a search is: trials by state, the best so far, and those of other settings or code (stale).
 
