@@ -72,18 +72,8 @@ ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
 }
 FULL = 16  # modules of a room
 VERBS = (
-    "common",
-    "doctor",
-    "evaluate",
-    "main",
-    "render",
-    "science",
-    "search",
-    "status",
-    "study",
-    "ui",
-    "verify",
-    "yardsticks",
+    *("common", "doctor", "evaluate", "main", "render", "science", "search"),
+    *("status", "study", "ui", "verify", "yardsticks"),
 )
 # What writes words of users where they are read: these take `reports.data.escaping` and `reports.render.glyphs` alone.
 WRITERS = tuple(

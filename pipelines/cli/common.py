@@ -115,8 +115,9 @@ def files_of_kind(folder: Path, kind: Kind, *, optional: bool = False) -> list[t
     found = [(file, *read(file)) for file in files]
     wanted = [(file, root, faults) for file, root, faults in found if kind_of(root) == kind]
     if not optional and not (wanted if kind == "search" else files):
-        words = "studies (*.yaml)" if kind == "study" else "searches (an arm has a space)"
-        raise InputError(f"{folder}: no {words} here; `rhmc study copy NAME` writes one of this package")
+        if kind == "search":
+            raise InputError(f"{folder}: no searches (an arm has a space) here; `rhmc search check FILE` takes one")
+        raise InputError(f"{folder}: no studies (*.yaml) here; `rhmc study copy NAME` writes one of this package")
     return wanted
 
 
