@@ -45,9 +45,9 @@ def _profiles(incomplete: str) -> list[str]:
 
 
 def _given(ctx: typer.Context) -> list[Path]:
-    """The files on a command line that is being completed."""
-    values = ctx.params.get("files") or [ctx.params.get("file") or ctx.params.get("what")]
-    return [Path(str(value)) for value in values if value]
+    """The files on a command line that is being completed. While it is not whole, they may be left unassigned."""
+    values = [*(ctx.params.get("files") or ()), ctx.params.get("file"), ctx.params.get("what"), *ctx.args]
+    return [Path(str(value)) for value in values if str(value).endswith(".yaml")]
 
 
 def _names(ctx: typer.Context, group: str, incomplete: str) -> list[str]:
