@@ -213,7 +213,7 @@ def _launch(studies: Sequence[Study], home: Home, interrupts: Interrupts, arms: 
 
 
 @contextmanager
-def _logged(study: Study, code: Code, home: Home, display: Board, arms: Sequence[str]) -> Iterator[Launched]:
+def _logged(study: Study, code: Code, home: Home, display: Board, arms: Sequence[str] = ()) -> Iterator[Launched]:
     """A study's log while it is written to; whatever happens, it ends with how far the study came."""
     from pipelines.tracking.mlflow_tracker import MlflowTracker  # 3 s: only when something is launched
 
