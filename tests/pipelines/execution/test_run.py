@@ -462,6 +462,7 @@ def test_a_server_that_is_not_mlflow(
 def test_the_status_as_json_has_the_exit_code_of_the_table(
     done: int, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    (tmp_path / "mlflow.db").touch()
     tracker = MemoryTracker(study_card(tiny()), [])
     for item in plan()[:done]:
         tracker.start(item.card).finish("finished")
