@@ -28,6 +28,7 @@ from pipelines.execution import ray_driver
 from pipelines.execution.finite import DivergedError
 from pipelines.execution.progress import PlainBoard
 from pipelines.execution.seed_group import Seeds
+from pipelines.execution.tally import Training
 from pipelines.execution.trainable import ending
 from pipelines.specs.search import EVAL_SEED, FIRST_SEED, Dimension, Search
 from pipelines.specs.study import Setting, Study, StudyError
@@ -446,6 +447,7 @@ def test_the_board_counts_the_trials_of_all_arms(tmp_path: Path) -> None:
     def counted(self: TrialLog, search: Search, tracker: Any, display: Any) -> None:
         make(self, search, tracker, display)
         queue.append(tally(search, world.arm_studies()))
+        assert queue[-1].waiting == {Training("IQL", 800): 5, Training("VDN", 800): 5}
         display.expect(queue[-1])
 
     with pytest.MonkeyPatch.context() as patch:
