@@ -447,7 +447,7 @@ def test_the_board_counts_the_trials_of_all_arms(tmp_path: Path) -> None:
     def counted(self: TrialLog, search: Search, tracker: Any, display: Any) -> None:
         make(self, search, tracker, display)
         queue.append(tally(search, world.arm_studies()))
-        assert queue[-1].waiting == {Training("IQL", 800): 5, Training("VDN", 800): 5}
+        assert queue[-1].waiting == {Training("IQL", 600): 5, Training("VDN", 600): 5}
         display.expect(queue[-1])
 
     with pytest.MonkeyPatch.context() as patch:
