@@ -72,18 +72,8 @@ ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
 }
 FULL = 16  # modules of a room
 VERBS = (
-    "common",
-    "doctor",
-    "evaluate",
-    "main",
-    "reference",
-    "render",
-    "science",
-    "search",
-    "study",
-    "ui",
-    "verify",
-    "yardsticks",
+    *("common", "doctor", "evaluate", "main", "reference", "render", "science", "search"),
+    *("status", "study", "ui", "verify", "yardsticks"),
 )
 # What writes words of users where they are read: these take `reports.data.escaping` and `reports.render.glyphs` alone.
 WRITERS = tuple(
@@ -135,6 +125,7 @@ HEAVY = {
 }
 LIGHT = {
     "pipelines.cli.main": HEAVY,
+    "pipelines.execution.standing": HEAVY,
     "pipelines.specs.study": HEAVY - {"torch", "numpy", "pydantic"},
     "pipelines.specs.search": HEAVY - {"torch", "numpy", "pydantic"} | {"optuna"},
 }

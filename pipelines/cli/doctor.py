@@ -4,7 +4,8 @@ from typing import Annotated
 
 import typer
 
-from pipelines.cli.common import DONE, UNFINISHED, Json, say, say_json
+from pipelines.cli.common import Json, say, say_json
+from pipelines.workspace.exit_codes import Exit
 
 MARK = {"ok": "ok   ", "note": "note ", "fault": "FAULT"}
 
@@ -13,7 +14,7 @@ def doctor(
     ray: Annotated[bool, typer.Option(help="Also start Ray, which takes seconds.")] = True,
     as_json: Json = False,
 ) -> None:
-    """Say what is wrong with this installation and its work folder, and what to do. Exit code 1 on a fault."""
+    """Say what is wrong with this installation and its work folder, and what to do. Exit code 4 on a fault."""
     from pipelines.cli.checks import examine
     from pipelines.workspace.work_folder import work_folder
 
@@ -24,4 +25,4 @@ def doctor(
             say(f"{MARK[finding.level]}  {finding.what}: {finding.text}")
     if as_json:
         say_json([finding._asdict() for finding in found])
-    raise typer.Exit(UNFINISHED if any(finding.level == "fault" for finding in found) else DONE)
+    raise typer.Exit(Exit.NO if any(finding.level == "fault" for finding in found) else Exit.DONE)

@@ -6,6 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from pipelines.cli.common import (
+    Arms,
     File,
     Json,
     Profile,
@@ -21,7 +22,6 @@ from pipelines.specs.limits import BOUNDS, EPISODES, JOBS, SEED
 from pipelines.workspace.errors import InputError
 
 CHECKPOINT = ".pt"
-Arms = Annotated[list[str] | None, typer.Option(help="Only this arm. Can be given several times.")]
 Seeds = Annotated[list[int] | None, typer.Option(min=0, max=SEED, help="Only this seed. Can be given several times.")]
 Out = Annotated[Path, typer.Option(help="Folder of the tables that the report reads; made if it is not there.")]
 

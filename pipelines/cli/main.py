@@ -2,8 +2,7 @@
 
 Everything heavy is imported by the verb that needs it, so that help answers at once.
 
-Exit codes: 0 done, 1 some run failed or some arm does not hold, 2 bad input (nothing was started), 130 interrupted,
-143 terminated.
+`pipelines.workspace.exit_codes` has the exit codes.
 """
 
 import errno
@@ -17,15 +16,16 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from pipelines.cli import doctor, evaluate, render, science, search, study, ui, verify, yardsticks
-from pipelines.cli.common import BAD, INTERRUPTED, UNFINISHED
+from pipelines.cli import doctor, evaluate, render, science, search, status, study, ui, verify, yardsticks
 from pipelines.workspace import streams
 from pipelines.workspace.addresses import reach_loopback, scrubbed
 from pipelines.workspace.errors import InputError, visible
+from pipelines.workspace.exit_codes import Exit
 
 EXIT_CODES = (
-    "Exit codes: 0 done; 1 a run failed or is not finished, or something is wrong; 2 bad input, nothing was started; "
-    "130 interrupted; 143 terminated. Results are kept in $RHMC_HOME, or in the folder work."
+    "Exit codes: 0 done; 1 a fault of the program; 2 bad input, nothing was started; 3 half done: a run failed or is "
+    "not finished; 4 done, and the answer is no; 130 interrupted; 143 terminated. Results are kept in $RHMC_HOME, "
+    "or in the folder work."
 )
 
 NO_PATH = (errno.ENAMETOOLONG, errno.EACCES, errno.ELOOP)  # what looking at a path says of the path alone
@@ -83,6 +83,7 @@ def options(
 app.add_typer(study.app, name="study")
 app.add_typer(search.app, name="search")
 app.add_typer(yardsticks.app, name="yardsticks")
+app.command("status", rich_help_panel=RESULTS)(status.status)
 app.command("evaluate", rich_help_panel=RESULTS)(evaluate.evaluate)
 app.command("transfer", rich_help_panel=RESULTS)(evaluate.transfer)
 app.command("assignments", rich_help_panel=RESULTS)(evaluate.assignments)
@@ -90,6 +91,7 @@ app.command("render", rich_help_panel=RESULTS)(render.render)
 app.command("export", rich_help_panel=RESULTS)(study.export)
 app.command("verify", rich_help_panel=RESULTS)(verify.verify)
 app.command("report", rich_help_panel=RESULTS)(science.report)
+app.command("verdicts", rich_help_panel=RESULTS)(science.verdicts)
 app.command("ui", rich_help_panel=RESULTS)(ui.ui)
 app.command("theorem", rich_help_panel=RESULTS)(science.theorem)
 app.command("methods", rich_help_panel=CODE)(science.methods)
@@ -108,19 +110,19 @@ def main() -> None:
         app(prog_name="rhmc")
     except InputError as error:
         print(scrubbed(str(error)), file=sys.stderr)
-        sys.exit(BAD)
+        sys.exit(Exit.BAD)
     except KeyboardInterrupt:
-        sys.exit(INTERRUPTED)
+        sys.exit(Exit.INTERRUPTED)
     except Exception as error:
         if isinstance(error, OSError) and (found := _of_the_system(error)):
             print(scrubbed(str(found)), file=sys.stderr)
-            sys.exit(BAD)
+            sys.exit(Exit.BAD)
         print(scrubbed(traceback.format_exc()), file=sys.stderr, end="")  # a fault of ours: the whole of it
-        sys.exit(UNFINISHED)
+        sys.exit(Exit.BROKEN)
     finally:
         if why := streams.lost():
             print(f"rhmc: standard output: {why}; what was printed is not all there", file=sys.stderr)
-            sys.exit(UNFINISHED)
+            sys.exit(Exit.BROKEN)
 
 
 def _of_the_system(error: OSError) -> InputError | None:

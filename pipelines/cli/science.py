@@ -1,7 +1,13 @@
-"""Verbs that describe the code: Theorem 1, the methods, the fingerprint; and the report from what was exported."""
+"""Verbs that describe the code: Theorem 1, the methods, the fingerprint; and the report from what was exported.
+
+DVC's stages begin with `rhmc profile` or `rhmc fingerprint`: these say which stage it is.
+"""
 
 import inspect
+import json
+import os
 import sys
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeVar
@@ -12,6 +18,7 @@ from pipelines.cli.common import Profile, folder_option, profile_faults, say, ta
 from pipelines.specs.limits import EPISODES, SEED
 from pipelines.specs.safe_names import PROFILES, fault_of_study, simple, study_name
 from pipelines.workspace.errors import InputError, visible_lines
+from pipelines.workspace.exit_codes import Exit
 from pipelines.workspace.files import fault_of, regular
 
 if TYPE_CHECKING:
@@ -20,6 +27,8 @@ if TYPE_CHECKING:
     from rhmc.types import Spec
 
 Entry = TypeVar("Entry")
+PIPELINE, STAGE = Path("dvc.yaml"), "DVC_STAGE"  # DVC names the stage to its commands in this variable
+REPORTED = {"whole": Exit.DONE, "undrawn": Exit.UNFINISHED, "refused": Exit.BAD}
 
 
 def theorem(
@@ -129,6 +138,7 @@ def fingerprint(file: Annotated[Path | None, typer.Argument(help="Write it there
     """Name the code that decides results: the same after editing a comment, another after editing behaviour."""
     from pipelines.specs.identity import fingerprint as of_code
 
+    _tell_stage()
     text = of_code() + "\n"
     if file is None:
         print(text, end="")
@@ -146,6 +156,7 @@ def profile(
     """Print the profile that the pipeline runs on, or say why there is none: its name goes into paths and commands."""
     from pipelines.specs.document import choices, read, show
 
+    _tell_stage()
     root, faults = read(file)
     written = root.children.get("profile") if root else None
     if faults:
@@ -155,6 +166,38 @@ def profile(
     if written.value not in PROFILES:
         raise InputError(f"{written.place}: profile: {show(written.value)} is not allowed; {choices('', PROFILES)}")
     say(str(written.value))
+
+
+def _tell_stage() -> None:
+    """Say on stderr which stage of the pipeline this process belongs to, if it does to one."""
+    from pipelines.specs.document import read
+
+    if not (name := os.environ.get(STAGE)) or not PIPELINE.is_file():
+        return
+    root, _ = read(PIPELINE)
+    stages = list(root.children["stages"].children) if root and "stages" in root.children else []
+    if name in stages:
+        tell(f"stage {stages.index(name) + 1} of {len(stages)}: {name}")
+
+
+def verdicts(
+    profile: Profile = "quick",
+    out: Annotated[Path | None, typer.Option(help="Folder of the report; results/<profile> if not given.")] = None,
+) -> None:
+    """Count the verdicts of a report, and print the address of its page."""
+    if faults := profile_faults(profile):
+        raise InputError(*faults)
+    folder = out or Path("results") / profile
+    claims = folder / "claims.json"
+    if fault := fault_of(claims):
+        raise InputError(f"{claims}: {fault}; `rhmc report` writes it")
+    try:
+        found = Counter(str(claim["verdict"]) for claim in json.loads(claims.read_text(encoding="utf-8")))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{claims}: not the claims of a report; `rhmc report` writes them") from error
+    counts = ", ".join(f"{count} {verdict}" for verdict, count in found.items())
+    say(f"Verdicts:  {sum(found.values())} claims: {counts or 'none'}")
+    say(f"Report:    {(folder / 'index.html').absolute().as_uri()}")
 
 
 def drawings(
@@ -192,4 +235,4 @@ def report(
     from reports.pages.build import write_report
 
     name = study_name(study, variant or "") if study else None
-    raise typer.Exit(write_report(runs, out, profile, name, visible_lines))
+    raise typer.Exit(REPORTED[write_report(runs, out, profile, name, visible_lines)])

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipelines.cli.common import BAD, DONE, Profile, files_in, folder_option, load_each, say, tell
+from pipelines.cli.common import Folder, Json, Profile, files_in, folder_option, listing, load_each, say, tell
 from pipelines.workspace.errors import InputError
+from pipelines.workspace.exit_codes import Exit
 
 if TYPE_CHECKING:
     from pipelines.specs.search import Search
@@ -38,6 +39,8 @@ app = typer.Typer(help="Search settings with the same budget for every method.",
 @app.command("check")
 def check(file: File, profile: Profile = "quick", overrides: Sets = None) -> None:
     """Say what a search would try, or everything that is wrong with it. Starts nothing."""
+    from pipelines.export.pace import estimated_search
+
     search = _search(file, profile, overrides)
     say(f"{search.name} ({search.profile}): {search.question}")
     for name, arm in search.arms.items():
@@ -48,6 +51,8 @@ def check(file: File, profile: Profile = "quick", overrides: Sets = None) -> Non
         f"{each * search.steps:,} in all; sampler {search.sampler.kind}, pruner {search.pruner.kind}, "
         f"{search.resources.concurrent} trials at a time"
     )
+    if hours := estimated_search(search, Path("results") / search.profile / "runs"):
+        say(hours)
     for remark in search.remarks:
         say(f"note: {remark}")
 
@@ -65,12 +70,18 @@ def run(file: File, profile: Profile = "quick", overrides: Sets = None, out: Out
 
 @app.command("status")
 def status(file: File, profile: Profile = "quick", overrides: Sets = None) -> None:
-    """Say how many trials are done, pruned, failed or missing, and what is best. Exit code 1 if any is left."""
+    """Say how many trials are done, pruned, failed or missing, and what is best. Exit code 3 if any is left."""
     search = _search(file, profile, overrides)
     from pipelines.tuning.search_run import show_search
     from pipelines.workspace.work_folder import work_folder
 
     raise typer.Exit(show_search(search, work_folder()))
+
+
+@app.command("list")
+def list_(folder: Folder = None, as_json: Json = False) -> None:
+    """List the searches of a folder with their questions and arms."""
+    listing(folder, "search", as_json)
 
 
 @app.command("export")
@@ -80,7 +91,7 @@ def export(
     out: Annotated[Path | None, typer.Option(help="Folder; results/<profile>/runs if not given.")] = None,
     overrides: Sets = None,
 ) -> None:
-    """Write each search's trials as one table, for the report. Exit code 1 if a budget is not spent."""
+    """Write each search's trials as one table, for the report. Exit code 3 if a budget is not spent."""
     searches = load_each(files, lambda file: _search(file, profile, overrides))
     from pipelines.tracking.plan import given_twice
     from pipelines.tuning.search_export import export_search
@@ -88,11 +99,12 @@ def export(
 
     if faults := given_twice(searches):
         raise InputError(*faults)
-    home, code = work_folder(), DONE
+    home = work_folder()
+    code: int = Exit.DONE
     for search in searches:
         code = max(code, export_search(search, out or Path("results") / profile / "runs", home))
-        if code == BAD:
-            raise typer.Exit(BAD)
+        if code == Exit.BAD:
+            raise typer.Exit(Exit.BAD)
     words = ["rhmc", "report", *(["--study", str(files[0])] if len(files) == 1 else [])]
     words += ["--profile", profile] if profile != "quick" else []
     words += ["--runs", str(out)] if out else []

@@ -2,31 +2,30 @@
 
 import shlex
 import sys
-from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from pipelines.cli.common import (
-    BAD,
-    DONE,
-    UNFINISHED,
+    Arms,
     File,
     Files,
+    Folder,
     Json,
     Profile,
     Sets,
     Variant,
+    listing,
     load_studies,
     load_study,
     say,
-    say_json,
     table,
     tell,
 )
 from pipelines.workspace.errors import InputError
+from pipelines.workspace.exit_codes import Exit
 from pipelines.workspace.files import regular
 
 if TYPE_CHECKING:
@@ -96,60 +95,41 @@ def _show_budget(study: "Study") -> None:
 
 
 @app.command("run")
-def run(files: Files, profile: Profile = "quick", variant: Variant = None, overrides: Sets = None) -> None:
+def run(
+    files: Files, profile: Profile = "quick", variant: Variant = None, arm: Arms = None, overrides: Sets = None
+) -> None:
     """Run what studies still lack. Finished runs are skipped, interrupted ones continue.
 
-    Several files are one queue: what they share is trained once.
+    Several files are one queue: what they share is trained once. With --arm the other arms wait for another launch.
     """
     studies = load_studies(files, profile, overrides, variant)
     from pipelines.execution.run import run_studies
     from pipelines.workspace.work_folder import work_folder
 
-    raise typer.Exit(run_studies(studies, work_folder()))
+    raise typer.Exit(run_studies(studies, work_folder(), arm or ()))
 
 
 @app.command("status")
 def status(
     file: File, profile: Profile = "quick", variant: Variant = None, as_json: Json = False, overrides: Sets = None
 ) -> None:
-    """Say how many runs are finished, under way, missing or stale (made by other code). Exit code 1 if any is left."""
-    study = load_study(file, profile, overrides, variant)
-    from pipelines.execution.run import show_status
+    """Say how many runs are finished, under way, missing or stale (made by other code). Exit code 3 if any is left."""
+    from pipelines.execution.standing import show_quickly
     from pipelines.workspace.work_folder import work_folder
 
-    raise typer.Exit(show_status(study, work_folder(), as_json=as_json))
+    code = show_quickly(file, profile, variant, overrides or (), work_folder(), as_json=as_json)
+    if code is None:
+        study = load_study(file, profile, overrides, variant)
+        from pipelines.execution.run import show_status
+
+        code = show_status(study, work_folder(), as_json=as_json)
+    raise typer.Exit(code)
 
 
 @app.command("list")
-def list_(
-    folder: Annotated[Path, typer.Option(help="Where the studies are.")] = Path("studies"), as_json: Json = False
-) -> None:
-    """List the studies of a folder with their questions and variants."""
-    with suppress(FileNotFoundError):
-        folder.stat()  # a name that cannot be looked at: from Python 3.13 on `glob` passes over it
-    files = sorted(folder.glob("*.yaml"))
-    if not files:
-        raise InputError(f"{folder}: no studies (*.yaml) here; `rhmc study copy NAME` writes one of this package")
-    found = [one for file in files if (one := _listed(file))]
-    if as_json:
-        say_json(found)
-        return
-    rows = [[one["study"], one["question"] or one["fault"], ", ".join(one["variants"])] for one in found]
-    table(["study", "question", "variants"], rows)
-
-
-def _listed(file: Path) -> dict[str, Any] | None:
-    """The listing of a study; None for a search, which has a space in an arm."""
-    from pipelines.specs.document import read
-
-    root, faults = read(file)
-    nodes = root.children if root else {}
-    if "arms" in nodes and any("space" in arm.children for arm in nodes["arms"].children.values()):
-        return None
-    question = " ".join(str(nodes["question"].value).split()) if "question" in nodes else ""
-    fault = "" if question else str(faults[0]) if faults else "no question"
-    variants = list(nodes["variants"].children) if "variants" in nodes else []
-    return {"study": str(file), "question": question, "variants": variants, "fault": fault}
+def list_(folder: Folder = None, as_json: Json = False) -> None:
+    """List the studies of a folder with their questions and variants. `rhmc search list` has the searches."""
+    listing(folder, "study", as_json)
 
 
 @app.command("copy")
@@ -231,7 +211,7 @@ def adopt_runs(
 ) -> None:
     """Let finished runs of other code count for the code here, where trainings of today repeat them bit for bit.
 
-    Exit code 1 if an arm is refused: the first value that differs is named, and its runs stay as they are.
+    Exit code 4 if an arm is refused: the first value that differs is named, and its runs stay as they are.
     """
     from pipelines.execution.adoption import adopt
     from pipelines.workspace.work_folder import work_folder
@@ -241,7 +221,7 @@ def adopt_runs(
         say(f"{study.name} ({study.profile})")
         proofs = adopt(study, work_folder(), verify, until, jobs, say)
         refused = refused or any(proof.difference for proof in proofs)
-    raise typer.Exit(UNFINISHED if refused else DONE)
+    raise typer.Exit(Exit.NO if refused else Exit.DONE)
 
 
 class Form(StrEnum):
@@ -278,11 +258,11 @@ def export(
         raise InputError("--runs: belongs to --format marl-eval")
     results = Path("results") / profile
     tables = runs or (results / "runs" if marl_eval or not out else out)
-    code = DONE
+    code: int = Exit.DONE
     for study in studies:
-        code = max(code, DONE if runs else export_study(study, tables))
-        if code == BAD:
-            raise typer.Exit(BAD)
+        code = max(code, Exit.DONE if runs else export_study(study, tables))
+        if code == Exit.BAD:
+            raise typer.Exit(Exit.BAD)
         if marl_eval:
             code = max(code, export_marl_eval(study.name, tables, out or results / "marl_eval"))
     if marl_eval:

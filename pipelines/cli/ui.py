@@ -15,9 +15,10 @@ from typing import Annotated
 
 import typer
 
-from pipelines.cli.common import DONE, UNFINISHED, say, tell
+from pipelines.cli.common import say, tell
 from pipelines.workspace.addresses import fault, scrubbed, without_password
 from pipelines.workspace.errors import InputError
+from pipelines.workspace.exit_codes import Exit
 
 HOST = "127.0.0.1"
 LOG = "ui.log"  # in the work folder: what MLflow says of every request
@@ -105,7 +106,7 @@ def _serve(uri: str, artifacts: Path, port: int, saved: Iterable[tuple[str, str,
         return
     if code:
         tell(f"rhmc: MLflow's server ended with exit code {code}; {log} says why")
-    raise typer.Exit(UNFINISHED if code else DONE)
+    raise typer.Exit(Exit.BROKEN if code else Exit.DONE)
 
 
 def _write_down(server: "subprocess.Popen[bytes]", log: Path) -> None:

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipelines.cli.common import DONE, UNFINISHED, Profile, say, table
+from pipelines.cli.common import Profile, say, table
 from pipelines.workspace.errors import InputError
+from pipelines.workspace.exit_codes import Exit
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -30,7 +31,7 @@ def verify(
 ) -> None:
     """Compare results with the published ones: the same bytes, or per arm the difference and a test of equivalence.
 
-    Exit code 1 where an arm is missing, has other settings, or is not shown to be equivalent.
+    Exit code 4 where an arm is missing, has other settings, or is not shown to be equivalent.
     """
     from pipelines.export.published import folder, trained
     from pipelines.export.published import retrain as train
@@ -54,7 +55,7 @@ def verify(
     except TableError as error:
         raise InputError(str(error)) from error
     _tell(compared, profile)
-    raise typer.Exit(DONE if all(one.holds for one in compared) else UNFINISHED)
+    raise typer.Exit(Exit.DONE if all(one.holds for one in compared) else Exit.NO)
 
 
 def _here(runs: Path | None, profile: str, studies: Sequence[str] | None) -> "tuple[pd.DataFrame, pd.DataFrame]":

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipelines.cli.common import DONE, Json, Profile, folder_option, profile_faults, say_json, table, tell
+from pipelines.cli.common import Json, Profile, folder_option, profile_faults, say_json, table, tell
 from pipelines.specs.limits import EPISODES, JOBS, SEED
 from pipelines.workspace.errors import InputError
 
@@ -83,7 +83,7 @@ def _score(
             tell(f"wrote {written}")
     if as_json:
         say_json(scores)
-        raise typer.Exit(DONE)
+        raise typer.Exit
     columns = list(dict.fromkeys(key for score in scores.values() for key in score))
     rows = [[name, *(f"{score[key]:.2f}" if key in score else "" for key in columns)] for name, score in scores.items()]
     table(["policy", *columns], rows, numbers=columns)

@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from pipelines.execution.progress import Board
-from pipelines.execution.recorder import Recorder
+from pipelines.execution.recorder import Recorder, kind_of
+from pipelines.execution.tally import Tally, Training
 from pipelines.tracking.plan import Item
 from pipelines.tracking.tracker import RunLog
 
@@ -51,6 +52,14 @@ class Recorders:
         for item in (item for one in self.each for item in one.todo()):
             wanted.setdefault(item.key, item)
         return list(wanted.values())
+
+    def tally(self, at_a_time: int) -> Tally:
+        """All runs of all studies, as they are now. at_a_time: trainings side by side."""
+        total, left = (sum(counts) for counts in zip(*((len(one.wanted), one.left) for one in self.each), strict=True))
+        waiting = [Training(kind_of(item), item.spec.trainer.steps) for item in self.todo()]
+        tally = Tally(total, total - left, waiting, at_a_time)
+        tally.failed = sum(len(one.failures) for one in self.each)
+        return tally
 
     def start(self, key: str) -> None:
         """See `Recorder.start`, as for all that follow."""

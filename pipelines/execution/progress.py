@@ -1,4 +1,6 @@
-"""The display of a running study: a live line per run on a terminal, plain lines elsewhere."""
+"""The display of a launch, of studies or a search: a live line per run and one for all on a terminal, plain lines
+elsewhere.
+"""
 
 import sys
 import time
@@ -7,18 +9,23 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Protocol, Self
+from typing import TYPE_CHECKING, Protocol, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.table import Table
 from rich.text import Text
 
+from pipelines.execution.tally import Ended, Tally, Training
 from pipelines.workspace.best_effort import decoration
 from pipelines.workspace.errors import visible
-from rhmc.types import Metrics
 
-EVERY = 10.0  # seconds between two plain lines of a run
+if TYPE_CHECKING:
+    from rhmc.types import Metrics
+
+EVERY, SELDOM = 10.0, 600.0  # seconds between two plain lines of a run, or of all: the least, and the most
+SHARE = 0.1  # of what has passed since the first: an hour's run does not fill the log
+STARTS = "Ray is starting, which takes some seconds"
 
 
 @dataclass
@@ -30,9 +37,9 @@ class Line:
     step: int = 0
     rate: float = 0.0  # environment steps per second
     score: float = float("nan")  # last return
-    shown: float = field(default=float("-inf"))  # when it was last printed
+    timer: "Timer" = field(default_factory=lambda: Timer())
 
-    def take(self, point: Metrics) -> None:
+    def take(self, point: "Metrics") -> None:
         """Read a new point."""
         self.step = int(point["step"])
         self.score = point.get("final/return", point.get("eval/return", self.score))
@@ -47,6 +54,27 @@ class Line:
     def __str__(self) -> str:
         steps = f"{min(self.step, self.total):,} of {self.total:,} steps"
         return f"{self.name}: {steps}, {self.rate:,.0f} steps/s, return {self.score:.2f}, {self.left} left"
+
+
+class Timer:
+    """Says when a line is due: soon at first, then less and less often."""
+
+    def __init__(self) -> None:
+        self.began = self.shown = time.monotonic()
+
+    def due(self, *, news: bool = False) -> bool:
+        """True if it is time for a line, which then counts as shown. news: it need not wait longer than at first."""
+        now = time.monotonic()
+        if now - self.shown < (EVERY if news else min(max(EVERY, SHARE * (now - self.began)), SELDOM)):
+            return False
+        self.shown = now
+        return True
+
+
+def for_all(tally: Tally) -> str:
+    """How far the whole queue is, in a line."""
+    left = tally.left()
+    return str(tally) if left is None else f"{tally}, about {duration(left)} left for all"
 
 
 def began(reached: int, total: int) -> str:
@@ -72,16 +100,20 @@ class Board(Protocol):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None: ...
 
-    def start(self, name: str, total: int, reached: int = 0) -> None:
-        """A run begins, or continues where it has `reached`; `total` environment steps."""
+    def expect(self, tally: Tally) -> None:
+        """What is about to be trained, before the first of it begins. The board keeps the tally."""
         ...
 
-    def points(self, name: str, points: list[Metrics]) -> None:
+    def start(self, name: str, total: int, reached: int = 0, kind: str = "") -> None:
+        """A run begins, or continues where it has `reached`; `total` environment steps. kind: see `Training`."""
+        ...
+
+    def points(self, name: str, points: "list[Metrics]") -> None:
         """A run got further."""
         ...
 
-    def end(self, name: str, outcome: str) -> None:
-        """A run ended."""
+    def end(self, name: str, outcome: str, ended: Ended = "waiting") -> None:
+        """A run ended: in words, and for the tally."""
         ...
 
     def say(self, text: str) -> None:
@@ -111,17 +143,21 @@ class SafeBoard:
     ) -> None:
         self._pass(lambda inner: inner.__exit__(kind, error, trace))
 
-    def start(self, name: str, total: int, reached: int = 0) -> None:
+    def expect(self, tally: Tally) -> None:
         """See `Board`."""
-        self._pass(lambda inner: inner.start(name, total, reached))
+        self._pass(lambda inner: inner.expect(tally))
 
-    def points(self, name: str, points: list[Metrics]) -> None:
+    def start(self, name: str, total: int, reached: int = 0, kind: str = "") -> None:
+        """See `Board`."""
+        self._pass(lambda inner: inner.start(name, total, reached, kind))
+
+    def points(self, name: str, points: "list[Metrics]") -> None:
         """See `Board`."""
         self._pass(lambda inner: inner.points(name, points))
 
-    def end(self, name: str, outcome: str) -> None:
+    def end(self, name: str, outcome: str, ended: Ended = "waiting") -> None:
         """See `Board`."""
-        self._pass(lambda inner: inner.end(name, outcome))
+        self._pass(lambda inner: inner.end(name, outcome, ended))
 
     def say(self, text: str) -> None:
         """See `Board`."""
@@ -143,11 +179,13 @@ class SafeBoard:
 
 
 class PlainBoard:
-    """Lines for a log file: a run's start and end, and what it did at most every ten seconds."""
+    """Lines for a log file: start and end of a run, and now and then what it did and how far all of them are."""
 
     def __init__(self, console: Console) -> None:
         self.console = console
         self.lines: dict[str, Line] = {}
+        self.tally: Tally | None = None
+        self.timer = Timer()  # of the tally
 
     def __enter__(self) -> Self:
         return self
@@ -157,25 +195,41 @@ class PlainBoard:
     ) -> None:
         pass
 
-    def start(self, name: str, total: int, reached: int = 0) -> None:
+    def expect(self, tally: Tally) -> None:
         """See `Board`."""
-        self.lines[name] = Line(name, total, shown=time.monotonic())
+        self.tally, self.timer = tally, Timer()
+        self.say(for_all(tally))
+
+    def start(self, name: str, total: int, reached: int = 0, kind: str = "") -> None:
+        """See `Board`."""
+        self.lines[name] = Line(name, total)
+        if self.tally:
+            self.tally.start(name, Training(kind, total), reached)
         self.say(f"{name}: {began(reached, total)}")
 
-    def points(self, name: str, points: list[Metrics]) -> None:
+    def points(self, name: str, points: "list[Metrics]") -> None:
         """See `Board`."""
         line = self.lines[name]
         for point in points:
             line.take(point)
-        if points and time.monotonic() - line.shown >= EVERY:
-            line.shown = time.monotonic()
+        if points and line.timer.due():
             self.say(str(line))
+        if self.tally:
+            self.tally.point(name, line.step)
+            self._all(self.tally)
 
-    def end(self, name: str, outcome: str) -> None:
+    def end(self, name: str, outcome: str, ended: Ended = "waiting") -> None:
         """See `Board`."""
         line = self.lines.pop(name, None)
         score = f", return {line.score:.2f}" if line and line.score == line.score else ""
         self.say(f"{name}: {outcome}{score}")
+        if self.tally:
+            self.tally.end(name, ended)
+            self._all(self.tally, news=True)
+
+    def _all(self, tally: Tally, *, news: bool = False) -> None:
+        if self.timer.due(news=news):
+            self.say(for_all(tally))
 
     def say(self, text: str) -> None:
         """See `Board`."""
@@ -183,7 +237,7 @@ class PlainBoard:
 
 
 class LiveBoard:
-    """One line per running run, redrawn in place; what ended stays above."""
+    """A line for all runs and one per running run, redrawn in place; what ended stays above."""
 
     def __init__(self, console: Console) -> None:
         text = ("{task.fields[steps]}", "{task.fields[rate]}", "{task.fields[score]}", "{task.fields[left]}")
@@ -191,6 +245,8 @@ class LiveBoard:
         columns = [first, BarColumn(20), *rest]
         self.progress = Progress(*columns, console=console, transient=True)
         self.lines: dict[str, tuple[Line, TaskID]] = {}
+        self.tally: Tally | None = None
+        self.all: TaskID | None = None  # the first line
 
     def __enter__(self) -> Self:
         self.progress.start()
@@ -201,14 +257,40 @@ class LiveBoard:
     ) -> None:
         self.progress.stop()
 
-    def start(self, name: str, total: int, reached: int = 0) -> None:
+    def expect(self, tally: Tally) -> None:
+        """See `Board`."""
+        if self.all is not None:
+            self.progress.remove_task(self.all)
+        self.tally = tally
+        self.all = self.progress.add_task("all", total=tally.total, steps="", rate="", score="", left="")
+        self._all()
+
+    def _all(self) -> None:
+        """Redraw the line for all."""
+        if self.tally is None or self.all is None:
+            return
+        tally, left = self.tally, self.tally.left()
+        failed = f"{tally.failed} failed" if tally.failed else ""
+        self.progress.update(
+            self.all,
+            completed=tally.finished,
+            steps=f"{tally.finished:,} of {tally.total:,} {tally.unit}",
+            rate=f"{len(tally.going)} running",
+            score=failed,
+            left="" if left is None else f"about {duration(left)} left for all",
+        )
+
+    def start(self, name: str, total: int, reached: int = 0, kind: str = "") -> None:
         """See `Board`."""
         task = self.progress.add_task(name, total=total, steps="starting", rate="", score="", left="")
         if reached:
             self.say(f"{name}: {began(reached, total)}")
         self.lines[name] = Line(name, total), task
+        if self.tally:
+            self.tally.start(name, Training(kind, total), reached)
+        self._all()
 
-    def points(self, name: str, points: list[Metrics]) -> None:
+    def points(self, name: str, points: "list[Metrics]") -> None:
         """See `Board`."""
         line, task = self.lines[name]
         for point in points:
@@ -221,9 +303,15 @@ class LiveBoard:
             score=f"return {line.score:.2f}",
             left=f"{line.left} left",
         )
+        if self.tally:
+            self.tally.point(name, line.step)
+        self._all()
 
-    def end(self, name: str, outcome: str) -> None:
+    def end(self, name: str, outcome: str, ended: Ended = "waiting") -> None:
         """See `Board`."""
+        if self.tally:
+            self.tally.end(name, ended)
+        self._all()
         line, task = self.lines.pop(name, (None, None))
         if line is None or task is None:
             self.say(f"{name}: {outcome}")

@@ -1,7 +1,7 @@
 """From results of training to the log and the board; knows neither Ray nor MLflow."""
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +30,18 @@ class Recorder:
         tracker: the log.
         home: where checkpoints lie.
         board: where progress is shown.
+        arms: what this launch trains; the others stay as they are. All arms if empty.
     """
 
-    def __init__(self, study: StudyCard, plan: list[Item], tracker: Tracker, home: Home, board: Board) -> None:
+    def __init__(
+        self,
+        study: StudyCard,
+        plan: list[Item],
+        tracker: Tracker,
+        home: Home,
+        board: Board,
+        arms: Collection[str] = (),
+    ) -> None:
         self.study, self.plan, self.tracker, self.home, self.board = study, plan, tracker, home, board
         self.logs: dict[str, RunLog] = {}
         self.arms: dict[str, str] = {}  # of the runs that were started, by key
@@ -42,10 +51,13 @@ class Recorder:
         self.busy = False  # whether one of them was out of reach, and may be trained by now
         recorded = tracker.recorded()
         done = finished(recorded)
-        for item in plan:
+        self.wanted = [item for item in plan if not arms or item.card.arm in arms]  # of this launch
+        others = [item for item in plan if arms and item.card.arm not in arms]
+        self.later = {item.key for item in others if (item.card.arm, item.key) not in done}  # left to another launch
+        for item in self.wanted:
             if (item.card.arm, item.key) not in done:
                 self.waiting[item.key].append(item)
-        self.skipped = len(plan) - self.left
+        self.skipped = len(self.wanted) - self.left
         self.overview = Overview(study, plan, tracker, recorded, board.say)
         self.overview.describe()
         self._set_aside(recorded)
@@ -60,18 +72,18 @@ class Recorder:
 
     def _tidy(self) -> None:
         """Remove what a launch left that was killed between finishing a run and removing its checkpoints."""
-        for key in {item.key for item in self.plan} - self.waiting.keys():
+        for key in {item.key for item in self.plan} - self.waiting.keys() - self.later:
             Checkpoints(self.home.checkpoints(key)).clear_unused()
 
     @property
     def left(self) -> int:
-        """Planned runs that are not finished."""
+        """Runs of this launch that are not finished."""
         return sum(len(items) for items in self.waiting.values())
 
     @property
     def status(self) -> Status:
         """The status of the study when the launch ends."""
-        return "failed" if self.failures else "interrupted" if self.left else "finished"
+        return "failed" if self.failures else "interrupted" if self.left or self.later else "finished"
 
     def reuse(self) -> None:
         """Copy what was finished already, for another arm or in another study, instead of training it again."""
@@ -94,7 +106,7 @@ class Recorder:
             copy_run(self.tracker, self.study, source, item, points, {"reused_from": source}, self.board.say)
             self.overview.points(item.card.arm, item.key, points)
             self.overview.ended(item.card.arm, item.key, "finished")
-            self.board.say(f"{item.name}: the same training was finished before; copied")
+            self.board.end(item.name, "the same training was finished before; copied", "finished")
 
     def todo(self) -> list[Item]:
         """One run for each training that is needed and did not fail, in the order of the plan."""
@@ -106,7 +118,7 @@ class Recorder:
         self.arms[key] = item.card.arm
         self.logs[key] = self.tracker.start(item.card)
         self.logs[key].text(CONFIG, resolved_yaml(item, self.study))
-        self.board.start(item.name, item.spec.trainer.steps, self._reached(item))
+        self.board.start(item.name, item.spec.trainer.steps, self._reached(item), kind_of(item))
 
     def _reached(self, item: Item) -> int:
         """Environment steps at the newest checkpoint, 0 without one."""
@@ -140,7 +152,7 @@ class Recorder:
         log, items, folder = self.logs[key], self.waiting[key], self.home.checkpoints(key)
         keep(log, folder, items[0].name, self.board.say)
         self._end(key, "finished")
-        self.board.end(items[0].name, "finished")
+        self.board.end(items[0].name, "finished", "finished")
         self._copy(log.ref, items[1:])
         del self.waiting[key]  # now that nothing of it can fail any more
         Checkpoints(folder).clear()
@@ -171,11 +183,16 @@ class Recorder:
         log.tag("error", error)
         log.text("error.txt", trace)
         self._end(key, "failed")
-        self.board.end(item.name, f"failed: {error}")
+        self.board.end(item.name, f"failed: {error}", "failed")
 
     def _end(self, key: str, status: Status) -> None:
         self.logs.pop(key).finish(status)
         self.overview.ended(self.arms[key], key, status)
+
+
+def kind_of(item: Item) -> str:
+    """Names the runs that train at one pace: of one method in one task."""
+    return f"{item.card.algorithm} in {item.card.task}"
 
 
 def copy_run(

@@ -1,6 +1,5 @@
 """Launch studies: what their plans still lack goes through Ray Tune, results go to the log as they come."""
 
-import json
 import os
 import shlex
 import shutil
@@ -14,17 +13,21 @@ from types import FrameType
 from typing import TYPE_CHECKING, NamedTuple, Self
 
 from pipelines.execution.joint_recorder import Recorders
-from pipelines.execution.progress import Board, board, print_table
+from pipelines.execution.progress import STARTS, Board, board, print_table
 from pipelines.execution.ray_settings import set_up_ray
 from pipelines.execution.recorder import Recorder
+from pipelines.execution.standing import Standing, by_arm, counted, show
+from pipelines.specs.document import choices
 from pipelines.specs.limits import absent
 from pipelines.specs.source_file import another, remember
 from pipelines.specs.study import Study
+from pipelines.tracking.kept_plan import KeptPlan, Options, Place, keep
 from pipelines.tracking.plan import Item, finished, given_twice, items, read_commit, study_card
 from pipelines.tracking.staleness import stale_lines, stale_runs
 from pipelines.tracking.tracker import Tracker
 from pipelines.workspace.addresses import without_password
 from pipelines.workspace.errors import InputError, visible
+from pipelines.workspace.exit_codes import Exit
 from pipelines.workspace.provenance import Host, host
 from pipelines.workspace.terminal import terminal
 from pipelines.workspace.work_folder import Home, StoreError
@@ -32,10 +35,8 @@ from pipelines.workspace.work_folder import Home, StoreError
 if TYPE_CHECKING:
     from pipelines.tracking.mlflow_tracker import MlflowTracker
 
-DONE, FAILED, BAD, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143  # exit codes
 
-
-def run_studies(studies: Sequence[Study], home: Path) -> int:
+def run_studies(studies: Sequence[Study], home: Path, arms: Sequence[str] = ()) -> int:
     """Bring studies to their end: skip what is finished, continue what was interrupted, train the rest.
 
     Their runs are one queue, in the order of the studies: no worker is idle while the last run of a study trains, and
@@ -44,10 +45,11 @@ def run_studies(studies: Sequence[Study], home: Path) -> int:
     Args:
         studies: the plans, one or more.
         home: the work folder.
+        arms: names of those that are trained; all if empty.
 
     Returns:
-        0 all finished, 1 some run failed, 2 environment error, 130 interrupted, 143 terminated. A second launch
-        is always safe.
+        0 all of these are finished, 3 some run failed, 2 environment error, 130 interrupted, 143 terminated. A second
+        launch is always safe.
 
     Raises:
         InputError: the studies cannot be launched together.
@@ -57,8 +59,21 @@ def run_studies(studies: Sequence[Study], home: Path) -> int:
         raise InputError(*faults)
     for remark in (remark for study in studies for remark in study.remarks):
         print(f"note: {remark}", file=sys.stderr)
-    names = [(study.name, study.profile) for study in studies]
-    return guarded(home, names, lambda place, interrupts: _launch(studies, place, interrupts))
+    having = having_arms(studies, arms)
+    names = [(study.name, study.profile) for study in having]
+    return guarded(home, names, lambda place, interrupts: _launch(having, place, interrupts, arms))
+
+
+def having_arms(studies: Sequence[Study], arms: Sequence[str]) -> Sequence[Study]:
+    """The studies that have one of these arms; all where none is named.
+
+    Raises:
+        InputError: no study has such an arm.
+    """
+    known = list(dict.fromkeys(name for study in studies for name in study.arms))
+    if faults := [f"--arm: '{arm}' is not allowed; {choices(arm, known)}" for arm in arms if arm not in known]:
+        raise InputError(*faults)
+    return [study for study in studies if not arms or not study.arms.keys().isdisjoint(arms)]
 
 
 def missing_devices(where: Iterable[tuple[str, str]]) -> Iterator[str]:
@@ -100,13 +115,13 @@ def guarded(home: Path, names: Sequence[tuple[str, str]], launch: Callable[[Home
             return launch(place, interrupts)
     except StoreError as error:
         print(f"rhmc: {error}", file=sys.stderr)
-        return BAD
+        return Exit.BAD
     except KeyboardInterrupt:
         print("rhmc: interrupted; the same command continues", file=sys.stderr)
         return interrupts.code
     except SystemExit:  # Ray's answer to SIGTERM while it starts
         print("rhmc: terminated; the same command continues", file=sys.stderr)
-        return TERMINATED
+        return Exit.TERMINATED
 
 
 class Interrupts:
@@ -119,7 +134,8 @@ class Interrupts:
     """
 
     def __init__(self) -> None:
-        self.code, self.came = INTERRUPTED, False
+        self.code: int = Exit.INTERRUPTED
+        self.came = False
         self.stop: Path | None = None  # the file that asks
 
     def __enter__(self) -> Self:
@@ -170,7 +186,7 @@ class Launched(NamedTuple):
     recorder: Recorder
 
 
-def _launch(studies: Sequence[Study], home: Home, interrupts: Interrupts) -> int:
+def _launch(studies: Sequence[Study], home: Home, interrupts: Interrupts, arms: Sequence[str]) -> int:
     with board(terminal()) as display, ExitStack() as logs:
         for study in studies:
             if remark := another(home, study.name, study.profile, study.file):
@@ -180,10 +196,10 @@ def _launch(studies: Sequence[Study], home: Home, interrupts: Interrupts) -> int
         if known.why:
             display.say(f"the commit is logged as unknown: {known.why}")
         code = Code(known.name, host())
-        launched = [logs.enter_context(_logged(study, code, home, display)) for study in studies]
+        launched = [logs.enter_context(_logged(study, code, home, display, arms)) for study in studies]
         recorders = Recorders([one.recorder for one in launched])
         if skipped := sum(one.skipped for one in recorders.each):
-            display.say(f"{skipped} of {sum(len(one.plan) for one in recorders.each)} runs were finished before")
+            display.say(f"{skipped} of {sum(len(one.wanted) for one in recorders.each)} runs were finished before")
         left = recorders.reuse()
         while left and not interrupts.came:
             train(studies, recorders, home, interrupts)
@@ -191,12 +207,13 @@ def _launch(studies: Sequence[Study], home: Home, interrupts: Interrupts) -> int
         for one in launched:
             one.recorder.overview.publish()
     _summary(launched)
-    found = {one.recorder.status for one in launched}
-    return FAILED if "failed" in found else interrupts.code if "interrupted" in found else DONE
+    if any(one.failures for one in recorders.each):
+        return Exit.UNFINISHED
+    return interrupts.code if any(one.left for one in recorders.each) else Exit.DONE
 
 
 @contextmanager
-def _logged(study: Study, code: Code, home: Home, display: Board) -> Iterator[Launched]:
+def _logged(study: Study, code: Code, home: Home, display: Board, arms: Sequence[str] = ()) -> Iterator[Launched]:
     """A study's log while it is written to; whatever happens, it ends with how far the study came."""
     from pipelines.tracking.mlflow_tracker import MlflowTracker  # 3 s: only when something is launched
 
@@ -206,7 +223,12 @@ def _logged(study: Study, code: Code, home: Home, display: Board) -> Iterator[La
     try:
         for remark in tracker.remarks:
             display.say(f"{study.name}: {remark}")
-        recorder = Recorder(card, items(study, *code), tracker, home, display)
+        plan = items(study, *code)
+        recorder = Recorder(card, plan, tracker, home, display, arms)
+        if study.file:
+            options = Options(study.file, study.profile, study.variant, study.overrides)
+            runs = {item.name: Place(item.card.arm, item.key) for item in plan}
+            keep(home, options, KeptPlan(study.name, runs, list(study.remarks)))
         yield Launched(study, tracker, recorder)
     finally:
         tracker.close(recorder.status if recorder else "interrupted")
@@ -222,6 +244,7 @@ def train(studies: Sequence[Study], recorders: Recorders, home: Home, interrupts
         StoreError: the log failed, or Ray cannot be reached.
         KeyboardInterrupt: interrupted a second time, before every run had saved itself.
     """
+    recorders.board.say(STARTS)
     set_up_ray()
     from pipelines.execution.ray_driver import fit, ray_session  # 3 s
 
@@ -249,6 +272,7 @@ def train(studies: Sequence[Study], recorders: Recorders, home: Home, interrupts
         with session as remarks, interrupts.go_to(stop):
             for remark in remarks:
                 recorders.board.say(remark)
+            recorders.board.expect(recorders.tally(resources.concurrent))
             fit(jobs, recorders, scratch, resources.concurrent, resources.cpus, stop)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
@@ -274,7 +298,7 @@ def _summary(launched: Sequence[Launched]) -> None:
     for one in launched:
         for name, error in one.recorder.failures.items():
             console.print(visible(f"failed: {name}: {error}"), soft_wrap=True)
-    tracker, left = launched[0].tracker, any(one.recorder.left for one in launched)
+    tracker, left = launched[0].tracker, any(one.recorder.left or one.recorder.later for one in launched)
     experiments = ", ".join(repr(one.tracker.name) for one in launched)
     lines = [
         f"look:  {tracker.where()}",
@@ -296,10 +320,11 @@ def _arguments(studies: Sequence[Study]) -> str:
 
 def _arms(plan: list[Item], tracker: Tracker) -> list[list[str]]:
     refs = {(run.arm, run.key): run.ref for run in tracker.recorded() if run.status == "finished"}
-    there = [refs[place] for arm in _by_arm(plan).values() for place in arm if place in refs]
+    arms = by_arm(_places(plan))
+    there = [refs[place] for places in arms.values() for place in places if place in refs]
     scores = {row.ref: row.value for row in tracker.rows(there, {SCORE})}
     table = []
-    for arm, places in _by_arm(plan).items():
+    for arm, places in arms.items():
         done = [refs[place] for place in places if place in refs]
         values = [scores[ref] for ref in done if ref in scores]
         mean = f"{sum(values) / len(values):.2f}" if values else "-"
@@ -307,68 +332,47 @@ def _arms(plan: list[Item], tracker: Tracker) -> list[list[str]]:
     return table
 
 
-def _by_arm(plan: list[Item]) -> dict[str, list[tuple[str, str]]]:
-    """The planned runs of each arm, as arm and key; what is planned twice once."""
-    arms: dict[str, dict[tuple[str, str], None]] = {}
-    for item in plan:
-        arms.setdefault(item.card.arm, {})[item.card.arm, item.key] = None
-    return {arm: list(places) for arm, places in arms.items()}
+def _places(plan: Iterable[Item]) -> list[Place]:
+    return [Place(item.card.arm, item.key) for item in plan]
 
 
 SCORE = "final/return"
-STATES = ("finished", "running", "interrupted", "failed", "missing")
 
 
 def show_status(study: Study, home: Path, *, as_json: bool = False) -> int:
     """Print how far a study is: per arm the runs finished, under way, failed (and why), missing, and stale (and why).
 
     Returns:
-        0 all finished, 1 not, 2 environment error.
+        0 all finished, 3 not, 2 environment error.
     """
     try:
-        found = _status(study, Home(home))
+        found = standing_of(study, Home(home))
     except StoreError as error:
         print(f"rhmc: {error}", file=sys.stderr)
-        return BAD
-    if as_json:
-        print(json.dumps({"study": study.name, "profile": study.profile} | found._asdict()))
-    else:
-        columns = ["planned", *STATES, "stale"]
-        rows = [[arm, *(str(one[c]) for c in columns)] for arm, one in found.arms.items()]
-        print_table(terminal(), ["arm", *columns], rows)
-        lines = [f"failed: {name}: {error}" for name, error in found.errors.items()]
-        lines += [*found.stale, *(f"note: {remark}" for remark in (*study.remarks, *found.remarks))]
-        terminal().print("\n".join(map(visible, lines)), soft_wrap=True, end="\n" if lines else "")
-    return DONE if found.finished else FAILED
+        return Exit.BAD
+    return show(study.name, study.profile, found, study.remarks, as_json=as_json)
 
 
-class Standing(NamedTuple):
-    """The progress of a study."""
+def standing_of(study: Study, home: Home) -> Standing:
+    """The progress of a study.
 
-    finished: bool  # all of it
-    arms: dict[str, dict[str, int]]  # runs by state
-    errors: dict[str, str]  # of each failed run, by its name
-    stale: list[str]  # why runs are no part of the plan, a line for each arm and reason
-    remarks: list[str]  # of the log
+    Raises:
+        StoreError: the log cannot be read.
+    """
+    tracker = None
+    if os.environ.get("MLFLOW_TRACKING_URI") or home.database.exists():
+        from pipelines.tracking.mlflow_tracker import open_existing  # 3 s: only where there may be a log
 
-
-def _status(study: Study, home: Home) -> Standing:
-    from pipelines.tracking.mlflow_tracker import open_existing
-
-    tracker = open_existing(study_card(study), home)
+        tracker = open_existing(study_card(study), home)
     recorded = tracker.recorded() if tracker else []
     plan = items(study)
     # Runs of a driver that was killed are logged as running; a log in this folder knows no other driver than one here.
     own = tracker is not None and tracker.own
     seen = {"running": "interrupted"} if own and not home.driven(study.name, study.profile) else {}
-    state = {(run.arm, run.key): seen.get(run.status, run.status) for run in recorded}
+    state = {Place(run.arm, run.key): seen.get(run.status, run.status) for run in recorded}
     planned = {(item.card.arm, item.key) for item in plan}
     others = stale_runs(plan, recorded, tracker) if tracker else []
-    of_arm = Counter(arm for arm, _ in others)
-    arms = {}
-    for arm, places in _by_arm(plan).items():
-        mine = Counter(state.get(place, "missing") for place in places)
-        arms[arm] = {"planned": len(places)} | {kind: mine[kind] for kind in STATES} | {"stale": of_arm[arm]}
+    arms = counted(_places(plan), state, Counter(arm for arm, _ in others))
     failed = {(run.arm, run.key): run.error for run in recorded if run.status == "failed"}
     errors = {item.name: failed[item.card.arm, item.key] for item in plan if (item.card.arm, item.key) in failed}
     return Standing(

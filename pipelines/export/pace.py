@@ -1,11 +1,13 @@
-"""The time that a study will take, judged by the runs that were exported here before."""
+"""The time that a study or a search will take, judged by the runs that were exported here before."""
 
 import json
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from statistics import median
 
 from pipelines.export.tables import read_parquet
+from pipelines.specs.search import Search
 from pipelines.specs.study import Study
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.work_folder import StoreError
@@ -21,16 +23,31 @@ def estimated(study: Study, folder: Path) -> str:
         study: what is planned.
         folder: of exported tables.
     """
-    pace = paces(folder)
     steps: dict[str, int] = {}
     for spec in {run.spec.id: run.spec for run in study.runs()}.values():
         steps[spec.algo.kind] = steps.get(spec.algo.kind, 0) + spec.trainer.steps
+    return _hours(steps, study.resources.concurrent, folder, "run")
+
+
+def estimated_search(search: Search, folder: Path) -> str:
+    """As `estimated`, of a search whose trials all go to their end; those that are pruned take less."""
+    steps: dict[str, int] = {}
+    for arm in search.arms.values():
+        kind = arm.setting.algo.kind
+        steps[kind] = steps.get(kind, 0) + search.trials * search.seeds * search.steps
+    hours = _hours(steps, search.resources.concurrent, folder, "trial")
+    return f"{hours}; less where trials are pruned" if hours and search.pruner.kind != "none" else hours
+
+
+def _hours(steps: Mapping[str, int], concurrent: int, folder: Path, unit: str) -> str:
+    """The hours for the environment steps of each method; nothing where one has no pace."""
+    pace = paces(folder)
     if not steps or not steps.keys() <= pace.keys():
         return ""
     hours = sum(count / pace[kind] for kind, count in steps.items()) / 3600
-    wall = hours / study.resources.concurrent
+    wall = hours / concurrent
     rates = ", ".join(f"{kind} {pace[kind]:,.0f}" for kind in steps)
-    each = f"{hours:.1f} hours of one run at a time, {wall:.1f} of {study.resources.concurrent}"
+    each = f"{hours:.1f} hours of one {unit} at a time, {wall:.1f} of {concurrent}"
     return f"about {each}, at the median pace of the runs in {folder} (steps/s: {rates})"
 
 

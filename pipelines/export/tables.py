@@ -17,6 +17,7 @@ from pipelines.specs.study import Study
 from pipelines.tracking.plan import Item, items, study_card
 from pipelines.tracking.tracker import Recorded, Row, Tracker
 from pipelines.workspace.errors import InputError, visible
+from pipelines.workspace.exit_codes import Exit
 from pipelines.workspace.files import regular
 from pipelines.workspace.work_folder import Home, StoreError, lacks_memory, reason, whole, work_folder
 from reports.data.schema import MADE, METRICS, READINGS, RUNS
@@ -34,7 +35,7 @@ def export_study(study: Study, out: Path, home: Path | None = None) -> int:
         home: work folder, see `work_folder`.
 
     Returns:
-        0 all planned runs are there and finished, 1 some are not (the files are written all the same), 2 environment
+        0 all planned runs are there and finished, 3 some are not (the files are written all the same), 2 environment
         error.
     """
     from pipelines.tracking.mlflow_tracker import open_existing
@@ -48,10 +49,10 @@ def export_study(study: Study, out: Path, home: Path | None = None) -> int:
         unfinished = write_tables(study, plan, tracker, out)
     except StoreError as error:
         print(f"rhmc: {error}", file=sys.stderr)
-        return 2
+        return Exit.BAD
     if unfinished:
         print(f"{study.name} ({study.profile}): {unfinished} of {len(plan)} runs are not finished", file=sys.stderr)
-    return 1 if unfinished else 0
+    return Exit.UNFINISHED if unfinished else Exit.DONE
 
 
 def write_tables(study: Study, plan: list[Item], tracker: Tracker | None, out: Path) -> int:

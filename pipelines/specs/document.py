@@ -8,6 +8,7 @@ import difflib
 import enum
 import json
 import math
+import os
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -25,7 +26,9 @@ from ruamel.yaml.nodes import Node as YamlNode
 from pipelines.specs import limits, renamed
 from pipelines.workspace.errors import seen
 from pipelines.workspace.files import ABSENT, fault_of
+from pipelines.workspace.root import project
 
+STUDIES = "studies"  # where a project has them
 LIMIT = 1_000_000  # bytes; larger is no study
 EXACT = 2**53  # floats below it that are whole numbers are read as integers: 5e6 is a number of steps
 DEEPEST = 30  # mappings and lists inside each other
@@ -117,8 +120,10 @@ def _unreadable(path: Path, fault: str) -> str:
             found = sorted(p.name for p in path.glob("*.yaml"))
             return "a directory; give one study" + (f" of it: {', '.join(found)}" if found else "")
         if fault == ABSENT:
-            near = [str(p) for folder in (path.parent, Path("studies")) for p in sorted(folder.glob("*.yaml"))]
-            return fault + nearest(str(path), near)
+            folders = (path.parent, Path(STUDIES), Path(os.path.relpath(project() / STUDIES)))
+            near = [str(p) for folder in folders for p in sorted(folder.glob("*.yaml"))]
+            same = [name for name in near if Path(name).stem == path.stem]  # `alpha` for `studies/alpha.yaml`
+            return fault + (f"; did you mean '{same[0]}'?" if same else nearest(str(path), near))
     return fault
 
 

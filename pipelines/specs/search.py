@@ -327,4 +327,5 @@ def _no_search(root: Node) -> list[Fault]:
     arms = root.children.get("arms", root).children
     if not arms or any("space" in arm.children for arm in arms.values()):
         return []
-    return [Fault(Place(root.place.source, 1, 1), "", "no arm has a space: a study, for `rhmc study`, is no search")]
+    text = "no arm has a space: a study, for `rhmc study check`, `run` and `status`, is no search"
+    return [Fault(Place(root.place.source, 1, 1), "", text)]

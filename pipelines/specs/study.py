@@ -691,7 +691,8 @@ def _no_study(root: Node) -> list[Fault]:
     """Say this alone where a search was given."""
     if not any("space" in arm.children for arm in _group(root, "arms").values()):
         return []
-    return [Fault(Place(root.place.source, 1, 1), "", "an arm has a space: a search, for `rhmc search`, is no study")]
+    text = "an arm has a space: a search, for `rhmc search check`, `run` and `status`, is no study"
+    return [Fault(Place(root.place.source, 1, 1), "", text)]
 
 
 def _no_value(root: Node, name: str, profile: str) -> list[Fault]:

@@ -13,6 +13,7 @@ from pipelines.specs.search import Search
 from pipelines.specs.source_file import another
 from pipelines.tuning.trials import Recorded, explained, look, opened, storage_url
 from pipelines.workspace.errors import visible
+from pipelines.workspace.exit_codes import Exit
 from pipelines.workspace.work_folder import Home, StoreError
 from reports.data.schema import TRIALS
 from rhmc.training.trainer import grid_step
@@ -32,7 +33,7 @@ def export_search(search: Search, out: Path, home: Path) -> int:
         home: the work folder.
 
     Returns:
-        0 every trial is complete or pruned, 1 some are not (the file is written all the same), 2 environment error.
+        0 every trial is complete or pruned, 3 some are not (the file is written all the same), 2 environment error.
     """
     place = Home(home)
     if remark := another(place, search.name, search.profile, search.file):
@@ -48,11 +49,11 @@ def export_search(search: Search, out: Path, home: Path) -> int:
         write_parquet(out / f"{search.name}.trials.parquet", TRIALS, rows)
     except StoreError as error:
         print(f"rhmc: {error}", file=sys.stderr)
-        return 2
+        return Exit.BAD
     unspent = sum(row[TRIALS.names.index("state")] not in SPENT for row in rows)
     if unspent:
         _say(f"{search.name} ({search.profile}): {unspent} of {len(rows)} trials are neither complete nor pruned")
-    return 1 if unspent else 0
+    return Exit.UNFINISHED if unspent else Exit.DONE
 
 
 def _row(search: Search, arm: str, index: int, trial: Recorded) -> Row:

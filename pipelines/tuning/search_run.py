@@ -17,9 +17,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from ruamel.yaml import YAML
 
-from pipelines.execution.progress import Board, StopFile, board, print_table
+from pipelines.execution.progress import STARTS, Board, StopFile, board, print_table
 from pipelines.execution.ray_settings import set_up_ray
-from pipelines.execution.run import BAD, DONE, FAILED, Interrupts, guarded, missing_devices
+from pipelines.execution.run import Interrupts, guarded, missing_devices
+from pipelines.execution.tally import Ended, Tally, Training
 from pipelines.specs.search import Search
 from pipelines.specs.source_file import another, remember
 from pipelines.tracking.plan import read_commit
@@ -29,6 +30,7 @@ from pipelines.tuning.trials import OBJECTIVE, ArmStudy, BaseStorage, TrialReque
 from pipelines.workspace.addresses import without_password
 from pipelines.workspace.best_effort import decoration
 from pipelines.workspace.errors import InputError, visible
+from pipelines.workspace.exit_codes import Exit
 from pipelines.workspace.terminal import terminal
 from pipelines.workspace.work_folder import Checkpoints, Home, StoreError
 from reports.data.escaping import markdown, prose
@@ -66,7 +68,7 @@ def run_search(search: Search, home: Path, out: Path | None = None) -> int:
             the search was changed by overrides: a trial of the tool does not replace the result of a real search.
 
     Returns:
-        0 every trial is finished or pruned, 1 some failed, 2 environment error, 130 interrupted, 143 terminated.
+        0 every trial is finished or pruned, 3 some failed, 2 environment error, 130 interrupted, 143 terminated.
     """
 
     def launch(place: Home, interrupts: Interrupts) -> int:
@@ -123,7 +125,7 @@ def _launch(search: Search, home: Home, storage: BaseStorage, out: Path, interru
     finally:
         tracker.close(status)
     _summary(search, arm_studies, tracker, written, whole)
-    return {"finished": DONE, "failed": FAILED}.get(status, interrupts.code)
+    return {"finished": int(Exit.DONE), "failed": int(Exit.UNFINISHED)}.get(status, interrupts.code)
 
 
 def _clear(search: Search, arm_study: ArmStudy, home: Home) -> None:
@@ -135,6 +137,7 @@ def _clear(search: Search, arm_study: ArmStudy, home: Home) -> None:
 def _train(
     search: Search, arm_studies: Sequence[ArmStudy], trial_log: "TrialLog", home: Home, interrupts: Interrupts
 ) -> None:
+    trial_log.board.say(STARTS)
     set_up_ray()
     from pipelines.execution.ray_driver import ray_session  # 3 s
     from pipelines.tuning.ray_workers import Pool
@@ -149,9 +152,17 @@ def _train(
         with session as remarks, interrupts.go_to(stop):
             for remark in remarks:
                 trial_log.board.say(remark)
+            trial_log.board.expect(tally(search, arm_studies))
             Drive(search, arm_studies, Pool(resources.concurrent, resources.cpus), trial_log, home, stop).run()
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+
+
+def tally(search: Search, arm_studies: Sequence[ArmStudy]) -> Tally:
+    """All trials of all arms, as they are now."""
+    closed = sum(arm_study.closed for arm_study in arm_studies)
+    waiting = [Training(one.arm, search.steps) for one in arm_studies for _ in range(one.left)]
+    return Tally(len(arm_studies) * search.trials, closed, waiting, search.resources.concurrent, "trials")
 
 
 @dataclass
@@ -303,7 +314,7 @@ class TrialLog:
         log = self.logs[card.key] = self.tracker.start(card)
         log.tag("trial", str(request.trial_index))
         log.text("config.yaml", self._yaml(request, card))
-        self.board.start(self._name(request), self.search.steps)
+        self.board.start(self._name(request), self.search.steps, kind=request.arm)
         return card.key
 
     def _yaml(self, request: TrialRequest, card: Card) -> str:
@@ -326,13 +337,13 @@ class TrialLog:
     def complete(self, key: str, request: TrialRequest, step: float, value: float) -> None:
         """A trial ended: its value is the metric `objective`, which a pruned one has not."""
         self.logs[key].log([{"step": step, "objective": value}])
-        self._end(key, request, "complete", "finished", f"objective {value:.2f}")
+        self._end(key, request, "complete", "finished", f"objective {value:.2f}", "finished")
 
     def prune(self, key: str, request: TrialRequest, why: str, status: Status) -> None:
         """A trial is given up."""
         if status == "failed":
             self.logs[key].tag("error", why)
-        self._end(key, request, "pruned", status, f"pruned, {why}")
+        self._end(key, request, "pruned", status, f"pruned, {why}", "finished")
 
     def interrupt(self, key: str, request: TrialRequest) -> None:
         """A trial saved itself for the next launch."""
@@ -346,13 +357,15 @@ class TrialLog:
         """A trial raised: keep why, go on with the others."""
         self.logs[key].tag("error", error)
         self.logs[key].text("error.txt", trace)
-        self._end(key, request, "failed", "failed", f"failed: {error}")
+        self._end(key, request, "failed", "failed", f"failed: {error}", "failed")
 
-    def _end(self, key: str, request: TrialRequest, state: str, status: Status, text: str) -> None:
+    def _end(
+        self, key: str, request: TrialRequest, state: str, status: Status, text: str, ended: Ended = "waiting"
+    ) -> None:
         log = self.logs.pop(key)
         log.tag("state", state)
         log.finish(status)
-        self.board.end(self._name(request), text)
+        self.board.end(self._name(request), text, ended)
 
     def _name(self, request: TrialRequest) -> str:
         return f"{self.search.name} / {request.name}"
@@ -472,22 +485,43 @@ def _short(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
+def standing_of(search: Search, place: Home) -> dict[str, int]:
+    """The trials of all arms by state, closed ones as `finished`, with `planned` and `stale`.
+
+    Raises:
+        StoreError: the database cannot be read.
+    """
+    found = dict.fromkeys(("finished", "running", "failed", "missing", "stale"), 0)
+    found["planned"] = search.trials * len(search.arms)
+    with opened(place, write=False) as storage, explained(storage_url(place)):
+        if storage is None:
+            return found | {"missing": found["planned"]}
+        for arm in search.arms:
+            arm_study, stale = look(search, arm, storage)
+            counts = arm_study.counts()
+            running = counts["running"] if place.driven(search.name, search.profile) else 0
+            mine = {"finished": arm_study.closed, "running": running, "failed": counts["failed"], "stale": stale}
+            found |= {name: found[name] + count for name, count in (mine | {"missing": counts["missing"]}).items()}
+    return found
+
+
 def show_search(search: Search, home: Path) -> int:
     """Print how far a search is: trials by state, the best so far, and those of other settings or code (stale).
 
     Returns:
-        0 every trial is closed, 1 not, 2 environment error.
+        0 every trial is closed, 3 not, 2 environment error.
     """
     place = Home(home)
     try:
         with opened(place, write=False) as storage, explained(storage_url(place)):
             if storage is None:
                 print(f"{search.name} ({search.profile}): nothing has been tried yet")
-                return FAILED
+                return Exit.UNFINISHED
             found = [look(search, arm, storage) for arm in search.arms]
             print_table(terminal(), [*HEADER, "stale"], [[*_row(arm_study), str(stale)] for arm_study, stale in found])
             print("\n".join(_best_line(arm_study) for arm_study, _ in found))
-            return DONE if all(arm_study.closed >= search.trials for arm_study, _ in found) else FAILED
+            whole = all(arm_study.closed >= search.trials for arm_study, _ in found)
+            return Exit.DONE if whole else Exit.UNFINISHED
     except StoreError as error:
         print(f"rhmc: {error}", file=sys.stderr)
-        return BAD
+        return Exit.BAD

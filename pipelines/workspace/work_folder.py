@@ -10,15 +10,17 @@ import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
-import torch
 from filelock import BaseFileLock, FileLock, Timeout
 
 from pipelines.workspace.addresses import scrubbed
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.leftovers import part_of, remove
-from rhmc.types import State
+from pipelines.workspace.root import project
+
+if TYPE_CHECKING:  # torch takes a second, and most verbs only look for the folder
+    from rhmc.types import State
 
 GLANCE = 0.5  # seconds that another process may hold a study's lock only to see whether it is free
 KEEP = 2  # checkpoints kept: should the newest be damaged, the one before is used; and as many damaged ones
@@ -38,12 +40,12 @@ class DamagedError(StoreError):
 
 
 def work_folder() -> Path:
-    """`$RHMC_HOME`, with `~` as a shell understands it, or `work` in the current folder.
+    """`$RHMC_HOME`, with `~` as a shell understands it, or `work` at the top of the checkout, else in this folder.
 
     Raises:
         StoreError: it is no path that the files of a database can have.
     """
-    name = os.path.expanduser(os.environ.get("RHMC_HOME") or "work")
+    name = os.path.expanduser(os.environ.get("RHMC_HOME") or project() / "work")
     try:
         name.encode()
         return _followed(Path(name))
@@ -152,13 +154,13 @@ class Checkpoints:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
-    def save(self, point: int, state: State) -> None:
+    def save(self, point: int, state: "State") -> None:
         """Write a checkpoint whole or not at all, and drop those older than the last two."""
         save_atomically(self.folder / f"{point:08d}.pt", state)
         for old in self._files()[KEEP:]:
             old.unlink(missing_ok=True)
 
-    def newest(self) -> State | None:
+    def newest(self) -> "State | None":
         """The newest checkpoint that is whole, or None. Damaged ones are set aside; what a killed writer left goes.
 
         Raises:
@@ -240,6 +242,8 @@ def save_atomically(path: Path, state: Any) -> None:
     Raises:
         StoreError: the disk is full or the folder closed; nothing half-written is left.
     """
+    import torch
+
     with whole(path, durable=True) as part, part.open("wb") as file:
         torch.save(state, file)
 
@@ -255,6 +259,8 @@ def load_whole(path: Path) -> Any:
         StoreError: it cannot be read now (memory, descriptors, rights, the disk), or not by this version.
         FileNotFoundError: there is none.
     """
+    import torch
+
     try:
         with path.open("rb") as file:
             _check_sums(file)
@@ -334,11 +340,17 @@ def without_replay(state: Any) -> Any:
     return state
 
 
-KEPT: dict[frozenset[str], Callable[[], State]] = {  # what learning keeps, by its keys, and the empty form of it
+KEPT: dict[frozenset[str], "Callable[[], State]"] = {  # what learning keeps, by its keys, and the empty form of it
     frozenset(("rows", "next", "size")): lambda: {"rows": {}, "next": 0, "size": 0},
     frozenset(("rows",)): lambda: {"rows": []},
-    frozenset(("rows", "count")): lambda: {"rows": {}, "count": torch.zeros(0, dtype=torch.int64)},
+    frozenset(("rows", "count")): lambda: {"rows": {}, "count": _nothing()},
 }
+
+
+def _nothing() -> Any:
+    import torch
+
+    return torch.zeros(0, dtype=torch.int64)
 
 
 def one_line(error: BaseException) -> str:

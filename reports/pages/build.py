@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from reports.claims import verdicts as rules
 from reports.claims.verdicts import Claim
@@ -23,8 +23,8 @@ from reports.render.glyphs import LOST
 from reports.render.tables import MEASURED, TABLES, Table
 from reports.render.vector import svg
 
+Outcome = Literal["whole", "undrawn", "refused"]  # of a report
 PART = ".report-"  # begins the name of the folder in which a report is made
-DONE, UNDRAWN, BAD = 0, 1, 2  # exit codes
 RUNS = "runs"  # the folder of the tables beside the page
 MADE = ("figures", TABLES, MEASURED, "claims.md", "claims.csv", "claims.json", "index.md", "index.html")
 
@@ -96,7 +96,7 @@ def write_report(
     profile: str = "quick",
     study: str | None = None,
     shown: Callable[[str], str] = str,
-) -> int:
+) -> Outcome:
     """Build a report as `build` does, and say on the terminal what became of it.
 
     Args:
@@ -106,7 +106,8 @@ def write_report(
         study: report on this one alone.
         shown: how a message is printed, which names folders as they were typed.
 
-    Returns 0, 1 if a figure could not be drawn, 2 if the tables are faulty: then nothing is written.
+    Returns:
+        `undrawn` if a figure could not be drawn; `refused` if the tables are faulty: then nothing is written.
     """
     home = Path("results") / profile
     out = out or (home / "study" / study if study else home)
@@ -114,11 +115,11 @@ def write_report(
         built = build(runs or home / RUNS, out, profile, study)
     except (TableError, PaperError, OutError) as error:
         print(shown(str(error)), file=sys.stderr)
-        return BAD
+        return "refused"
     for line in [*built.undrawn, *([f"note: {built.note}"] if built.note else [])]:
         print(shown(line), file=sys.stderr)
     print(shown(f"{len(built.files)} files; start with {out / 'index.html'}"))
-    return UNDRAWN if built.undrawn else DONE
+    return "undrawn" if built.undrawn else "whole"
 
 
 def _write(report: Report, folder: Path) -> Report:

@@ -146,7 +146,7 @@ def test_a_table_of_another_form_is_a_line_and_the_old_report_stays(
     old = tmp_path / "out" / "index.html"
     old.parent.mkdir()
     old.write_text("old")
-    assert write_report(tmp_path / "runs", old.parent) == 2
+    assert write_report(tmp_path / "runs", old.parent) == "refused"
     said = capsys.readouterr()
     assert line in said.err
     assert len(said.err.splitlines()) <= 6  # a line a fault, and of each kind the first five
@@ -205,7 +205,7 @@ def test_a_malformed_paper_is_a_line(
     assert old in STATED
     monkeypatch.setattr(paper, "FILE", tmp_path / "paper.yaml")
     paper.FILE.write_text(STATED.replace(old, new, 1), encoding="utf-8")
-    assert write_report(fresh(tmp_path / "runs"), tmp_path / "out") == 2
+    assert write_report(fresh(tmp_path / "runs"), tmp_path / "out") == "refused"
     said = capsys.readouterr().err.splitlines()
     assert any(line in one for one in said)
     assert all(one.startswith("paper.yaml: ") for one in said)
@@ -278,7 +278,7 @@ def test_a_figure_that_cannot_be_saved_leaves_its_numbers(
 
     monkeypatch.setattr(figures, "learning_curves", broken)
     out = tmp_path / "out"
-    assert write_report(fresh(tmp_path / "runs"), out) == 1
+    assert write_report(fresh(tmp_path / "runs"), out) == "undrawn"
     said = capsys.readouterr()
     assert said.err == "curves_reach: could not be drawn (ValueError: no ink)\n"
     assert "start with" in said.out
@@ -333,7 +333,7 @@ def test_what_a_killed_report_left_is_swept(tmp_path: Path) -> None:
 def test_two_reports_in_one_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     runs, out = fresh(tmp_path / "runs"), tmp_path / "out"
     with report._held(out):
-        assert write_report(runs, out) == 2
+        assert write_report(runs, out) == "refused"
     assert capsys.readouterr().err == f"{out}: another report is being written there; wait for it, or give --out\n"
     assert list(out.iterdir()) == []
 
@@ -342,7 +342,7 @@ def test_a_place_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     runs = fresh(tmp_path / "runs")
     (tmp_path / "file").write_text("mine")
     for out in (tmp_path / "file", tmp_path / "file" / "below", tmp_path / ("x" * 300)):
-        assert write_report(runs, out) == 2
+        assert write_report(runs, out) == "refused"
         assert f"{out}: cannot be written (" in capsys.readouterr().err
     assert (tmp_path / "file").read_text() == "mine"
 

@@ -111,7 +111,7 @@ def exported(home: Path, bundle: Path) -> int:
 
 def reported(home: Path, bundle: Path) -> int:
     """`rhmc report`, from tables that were exported before."""
-    return build.write_report(home.parent / "tables", home / OUT, study=STUDY.name)
+    return int(build.write_report(home.parent / "tables", home / OUT, study=STUDY.name) != "whole")
 
 
 def imported(home: Path, packed: Path) -> int:

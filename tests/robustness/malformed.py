@@ -388,7 +388,7 @@ def environments() -> Iterator[Case]:
         ("a database", "OPTUNA_STORAGE", "postgresql://u:hide@127.0.0.1:1/x", "search status", search, "127.0.0.1"),
     ]:
         words = (*verb.split(" "), "s.yaml")
-        codes = (1, BAD) if name == "an empty folder" else (BAD,)  # to `status`, nothing is there yet
+        codes = (3, BAD) if name == "an empty folder" else (BAD,)  # to `status`, nothing is there yet
         env = {variable: value}
         yield Case("environment", f"{variable}: {name}", words, tuple(says), making, env, codes, home)
     for name, value in [("a web address", "http://x"), ("nobody there", "127.0.0.1:1"), ("a port", "127.0.0.1:x")]:

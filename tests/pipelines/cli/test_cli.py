@@ -23,10 +23,12 @@ from pipelines.cli import ui
 from pipelines.cli.checks import Finding
 from pipelines.cli.doctor import MARK
 from pipelines.cli.main import app
+from pipelines.execution.standing import Standing
 from pipelines.export import yardsticks
 from pipelines.specs.identity import fingerprint
 from pipelines.workspace.process_pool import KILLED
 from pipelines.workspace.provenance import host
+from pipelines.workspace.work_folder import work_folder
 from rhmc.yardsticks.scores import names
 from tests.pipelines.support import Said, jobs_of, run_rhmc
 from tests.pipelines.workspace.pooled import die
@@ -45,6 +47,17 @@ steps: 1000
 
 
 Rhmc = Callable[..., Said]
+
+
+SEARCH = (
+    STUDY[: STUDY.index("arms")]
+    + """\
+arms: {IQL: {space: {lr: {choices: [0.1]}}}}
+trials: 5
+seeds: 1
+steps: 1000
+"""
+)
 
 
 @pytest.fixture
@@ -115,7 +128,7 @@ def test_the_page_of_the_command_line_names_every_verb() -> None:
 @pytest.mark.parametrize(
     ("line", "offered"),
     [
-        ("rhmc st", {"study"}),
+        ("rhmc st", {"study", "status"}),
         ("rhmc study ", {"check", "run", "status", "list", "copy", "export", "import", "adopt"}),
         ("rhmc study run studies/al", {"studies/alpha.yaml", "studies/alpha_regulation.yaml"}),
         ("rhmc study run studies/alpha.yaml --profile q", {"quick"}),
@@ -127,6 +140,26 @@ def test_the_shell_completes(line: str, offered: set[str]) -> None:
     command = [sys.executable, "-m", "pipelines.cli.main"]
     done = subprocess.run(command, env=os.environ | words, capture_output=True, text=True, cwd=ROOT, check=False)
     assert set(done.stdout.split()) == offered
+
+
+def test_arms_and_variants_are_completed(tmp_path: Path) -> None:
+    (tmp_path / "studies").mkdir()
+    (tmp_path / "studies/x.yaml").write_text(STUDY + "variants: {large: {algo: {hidden_dim: 128}}}\n")
+    grid = STUDY.replace("seeds:", "grid: {algo.lr: [0.1, 0.2]}\nseeds:")
+    (tmp_path / "studies/grid.yaml").write_text(grid)
+    for line, offered in [
+        ("rhmc study run studies/x.yaml --arm ", ["full", "none"]),
+        ("rhmc study run studies/x.yaml --arm n", ["none"]),
+        ("rhmc evaluate studies/x.yaml --arm f", ["full"]),
+        ("rhmc study run studies/x.yaml --variant ", ["large"]),
+        ("rhmc study run studies/grid.yaml --arm none", ["none, lr=0.1", "none, lr=0.2"]),
+        ("rhmc study run studies/gone.yaml --arm ", []),
+    ]:
+        words = {"COMP_WORDS": line, "COMP_CWORD": str(line.count(" ")), "_RHMC_COMPLETE": "complete_bash"}
+        command = [sys.executable, "-m", "pipelines.cli.main"]
+        env = os.environ | words | {"PYTHONPATH": str(ROOT)}
+        done = subprocess.run(command, env=env, capture_output=True, text=True, cwd=tmp_path, check=False)
+        assert ([word for word in done.stdout.splitlines() if word], done.stderr) == (offered, ""), line
 
 
 # Studies
@@ -215,6 +248,61 @@ def test_list_leaves_searches_out(rhmc: Rhmc) -> None:
     assert [one["study"] for one in json.loads(rhmc("study", "list", "--json").out)] == ["studies/x.yaml"]
 
 
+def test_studies_and_searches_are_listed_apart(rhmc: Rhmc) -> None:
+    said = rhmc("search", "list")
+    assert said == (2, "", "studies: no searches (an arm has a space) here; `rhmc search check FILE` takes one\n")
+    Path("studies/search_y.yaml").write_text(SEARCH)
+    (one,) = json.loads(rhmc("search", "list", "--json").out)
+    assert (one["search"], one["arms"], one["fault"]) == ("studies/search_y.yaml", ["IQL"], "")
+    assert [one["study"] for one in json.loads(rhmc("study", "list", "--json").out)] == ["studies/x.yaml"]
+
+
+def test_the_work_folder_and_the_studies_are_those_of_the_checkout(
+    rhmc: Rhmc, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("RHMC_HOME")
+    inside = tmp_path / "docs" / "deep"
+    inside.mkdir(parents=True)
+    monkeypatch.chdir(inside)
+    assert work_folder() == inside / "work"
+    for name in ("dvc.yaml", "params.yaml"):
+        (tmp_path / name).touch()
+    assert work_folder() == tmp_path / "work"
+    assert [one["study"] for one in json.loads(rhmc("study", "list", "--json").out)] == ["../../studies/x.yaml"]
+    said = rhmc("study", "check", "x")
+    assert said == (2, "", "x: no such file; did you mean '../../studies/x.yaml'?\n")
+    monkeypatch.setattr(os, "getuid", lambda: 1_234_567)  # the folder is another user's
+    assert work_folder() == inside / "work"
+
+
+def test_the_status_of_everything_is_one_table(rhmc: Rhmc, tmp_path: Path) -> None:
+    Path("studies/search_y.yaml").write_text(SEARCH)
+    Path("studies/bad.yaml").write_text("a: [")
+    said = rhmc("status", "--json")
+    bad, plain, search = json.loads(said.out)
+    assert (said.code, said.err) == (3, "")
+    assert bad["state"].startswith("faulty: studies/bad.yaml:1:")
+    counts = {"finished": 0, "running": 0, "failed": 0, "stale": 0}
+    assert plain == {"file": "studies/x.yaml", "kind": "study", "state": "not begun", "planned": 4} | counts
+    assert search == {"file": "studies/search_y.yaml", "kind": "search", "state": "not begun", "planned": 5} | counts
+    assert not (tmp_path / "work").exists()
+    table = rhmc("status").out
+    assert [line.split()[:4] for line in table.splitlines() if "x.yaml" in line] == [
+        ["studies/x.yaml", "study", "not", "begun"]
+    ]
+
+
+def test_a_study_that_is_finished_is_so_in_the_table(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> None:
+    arms = {"full": {"planned": 2, "finished": 2}, "none": {"planned": 2, "finished": 1, "running": 1, "stale": 3}}
+    monkeypatch.setattr("pipelines.execution.run.standing_of", lambda study, home: Standing(False, arms, {}, [], []))
+    said = rhmc("status", "--json")
+    (one,) = json.loads(said.out)
+    assert (said.code, one["state"], one["finished"], one["planned"], one["stale"]) == (3, "running", 3, 4, 3)
+    arms["none"] = {"planned": 2, "finished": 2}
+    said = rhmc("status", "--json")
+    assert (said.code, json.loads(said.out)[0]["state"]) == (0, "finished")
+
+
 def test_list_for_scripts(rhmc: Rhmc) -> None:
     Path("studies/bad.yaml").write_text("a: [")
     Path("studies/two.yaml").write_text(STUDY + "variants: {paper_faithful: {algo: {encoder: mlp}}}\n")
@@ -226,7 +314,7 @@ def test_list_for_scripts(rhmc: Rhmc) -> None:
 def test_status_for_scripts(rhmc: Rhmc) -> None:
     said = rhmc("study", "status", "studies/x.yaml", "--json")
     none = {"planned": 2, "finished": 0, "running": 0, "interrupted": 0, "failed": 0, "missing": 2, "stale": 0}
-    assert (said.code, said.err) == (1, "")
+    assert (said.code, said.err) == (3, "")
     arms = {"full": none, "none": none}
     expected = {
         "study": "x",
@@ -243,7 +331,9 @@ def test_status_for_scripts(rhmc: Rhmc) -> None:
 def test_every_verb_of_studies_takes_a_variant(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> None:
     Path("studies/x.yaml").write_text(STUDY + "variants: {large: {algo: {hidden_dim: 128}}}\n")
     names: list[str] = []
-    monkeypatch.setattr("pipelines.execution.run.run_studies", lambda studies, home: names.append(studies[0].name) or 0)
+    monkeypatch.setattr(
+        "pipelines.execution.run.run_studies", lambda studies, *given: names.append(studies[0].name) or 0
+    )
     for place in ("execution.run.show_status", "export.tables.export_study"):
         monkeypatch.setattr(f"pipelines.{place}", lambda study, *a, **k: names.append(study.name) or 0)
     for verb in (["study", "run"], ["study", "status"], ["export"]):
@@ -276,7 +366,7 @@ def test_the_doctor_answers_with_lines_and_an_exit_code(
 ) -> None:
     given = Finding(level, "disk", "text")
     monkeypatch.setattr("pipelines.cli.checks.examine", lambda home, *, ray: iter([given] * (2 - ray)))
-    assert rhmc("doctor").code == (level == "fault")
+    assert rhmc("doctor").code == (4 if level == "fault" else 0)
     assert rhmc("doctor", "--no-ray").out.splitlines() == [f"{MARK[level]}  disk: text"] * 2
     assert json.loads(rhmc("doctor", "--json").out) == [{"level": level, "what": "disk", "text": "text"}]
 
@@ -290,9 +380,9 @@ def test_run_hands_on_the_studies_the_work_folder_and_the_exit_code(
     shutil.copy("studies/x.yaml", "studies/y.yaml")
     words = ["studies/x.yaml", "studies/y.yaml", "--profile", "paper", "--set", "seeds=1"]
     assert rhmc("study", "run", *words).code == code
-    ((studies, home),) = calls
+    ((studies, home, arms),) = calls
     assert [(study.name, study.profile, study.seeds) for study in studies] == [("x", "paper", 1), ("y", "paper", 1)]
-    assert home == tmp_path / "work"
+    assert (home, arms) == (tmp_path / "work", ())
 
 
 def test_what_is_wrong_with_several_studies_is_said_at_once(rhmc: Rhmc, tmp_path: Path) -> None:
@@ -325,10 +415,10 @@ def test_studies_that_cannot_run_together(rhmc: Rhmc, tmp_path: Path) -> None:
 
 def test_export_goes_to_the_folder_of_the_profile(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[tuple[Any, ...]] = []
-    monkeypatch.setattr("pipelines.export.tables.export_study", lambda study, out: calls.append((study.name, out)) or 1)
+    monkeypatch.setattr("pipelines.export.tables.export_study", lambda study, out: calls.append((study.name, out)) or 3)
     report = "next:  rhmc report --study studies/x.yaml"
-    assert rhmc("export", "studies/x.yaml", "--profile", "paper") == (1, "", f"{report} --profile paper\n")
-    assert rhmc("export", "studies/x.yaml", "--out", "there") == (1, "", f"{report} --runs there\n")
+    assert rhmc("export", "studies/x.yaml", "--profile", "paper") == (3, "", f"{report} --profile paper\n")
+    assert rhmc("export", "studies/x.yaml", "--out", "there") == (3, "", f"{report} --runs there\n")
     monkeypatch.setattr("pipelines.export.tables.export_study", lambda study, out: 2)
     assert rhmc("export", "studies/x.yaml") == (2, "", "")
     assert calls == [("x", Path("results/paper/runs")), ("x", Path("there"))]
@@ -336,10 +426,10 @@ def test_export_goes_to_the_folder_of_the_profile(rhmc: Rhmc, monkeypatch: pytes
 
 def test_export_of_several_studies(rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copy("studies/x.yaml", "studies/y.yaml")
-    codes = {"x": 1, "y": 0}
+    codes = {"x": 3, "y": 0}
     monkeypatch.setattr("pipelines.export.tables.export_study", lambda study, out: codes[study.name])
     words = ["export", "studies/x.yaml", "studies/y.yaml"]
-    assert rhmc(*words) == (1, "", "next:  rhmc report\n")
+    assert rhmc(*words) == (3, "", "next:  rhmc report\n")
     codes["x"] = 2
     assert rhmc(*words) == (2, "", "")
 
@@ -364,10 +454,23 @@ def test_report_hands_on_its_options(
     rhmc: Rhmc, monkeypatch: pytest.MonkeyPatch, options: list[str], given: tuple[object, ...]
 ) -> None:
     calls: list[tuple[object, ...]] = []
-    build = SimpleNamespace(write_report=lambda *given: calls.append(given[:4]) or 2)
+    build = SimpleNamespace(write_report=lambda *given: calls.append(given[:4]) or "refused")
     monkeypatch.setitem(sys.modules, "reports.pages.build", build)
     assert rhmc("report", *options).code == 2
     assert calls == [given]
+
+
+def test_the_verdicts_are_counted_and_the_page_is_a_link(rhmc: Rhmc, tmp_path: Path) -> None:
+    said = rhmc("verdicts")
+    assert (said.code, said.err) == (2, "results/quick/claims.json: no such file; `rhmc report` writes it\n")
+    folder = tmp_path / "a b"
+    folder.mkdir()
+    (folder / "claims.json").write_text('[{"verdict": "yes"}, {"verdict": "no"}, {"verdict": "yes"}]')
+    said = rhmc("verdicts", "--out", str(folder))
+    page = f"file://{tmp_path}/a%20b/index.html"
+    assert said == (0, f"Verdicts:  3 claims: 2 yes, 1 no\nReport:    {page}\n", "")
+    (folder / "claims.json").write_text('["yes"]')
+    assert rhmc("verdicts", "--out", str(folder)).code == 2
 
 
 # Yardsticks

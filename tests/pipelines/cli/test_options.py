@@ -115,15 +115,15 @@ CASES = [
     ),
     Case(
         "report --profile paper --study studies/x.yaml --variant large --runs r --out o",
-        {"reports.pages.build.write_report": 0},
+        {"reports.pages.build.write_report": "whole"},
         ("write_report(r, o, paper, x@large, visible_lines)",),
     ),
     Case("methods --out o", {"pipelines.export.methods.export_methods": ""}, ("export_methods(o)",)),
     Case("drawings --out o", {"pipelines.export.drawings.export_drawings": []}, ("export_drawings(o)",)),
     Case(
-        f"study run studies/x.yaml {OTHER}",
+        f"study run studies/x.yaml {OTHER} --arm full --arm none",
         {"pipelines.execution.run.run_studies": 0},
-        ("run_studies([x@large paper 3], work)",),
+        ("run_studies([x@large paper 3], work, [full, none])",),
     ),
     Case(
         f"study status studies/x.yaml {OTHER} --json",
@@ -198,6 +198,9 @@ ELSEWHERE = {  # verbs whose options have tests of their own
     "ui": "pipelines/cli/test_cli.py",
     "doctor": "pipelines/cli/test_cli.py",
     "study list": "pipelines/cli/test_cli.py",
+    "search list": "pipelines/cli/test_cli.py",
+    "status": "pipelines/cli/test_cli.py",
+    "verdicts": "pipelines/cli/test_cli.py",
 }
 
 

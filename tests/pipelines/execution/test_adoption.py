@@ -157,7 +157,7 @@ def command(*words: str) -> tuple[int, list[str]]:
 
 def test_an_arm_is_adopted_and_another_refused(pair: Study, home: Path, tmp_path: Path) -> None:
     code, (_, first, second) = command("--verify", "2")
-    assert code == 1
+    assert code == 4
     assert first.startswith("adopted: 2 runs of arm 'slow': seeds 0, 1 trained again to step 600, ")
     assert second.startswith("refused: arm 'fast', seed 1, step 200, eval/return: ")
     found = adopted(home, pair)

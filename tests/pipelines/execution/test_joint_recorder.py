@@ -252,7 +252,7 @@ def test_a_failure_of_the_second_study_is_one_of_the_launch(
     blocked = Home(home).checkpoints(f"{SECOND.runs()[1].spec.id}-{CODE}")
     blocked.parent.mkdir(parents=True)
     blocked.touch()  # a file where the checkpoints should go
-    assert run_studies([FIRST, SECOND], home) == 1
+    assert run_studies([FIRST, SECOND], home) == 3
     said = capsys.readouterr().out
     assert "failed: second / faster s0: " in said
     assert said.endswith("rhmc study run studies/first.yaml studies/second.yaml --profile quick   (continues)\n")

@@ -361,7 +361,7 @@ def test_runs_of_a_killed_driver_are_not_said_to_be_running(home: Path, capsys: 
     MlflowTracker(study_card(study), Home(home)).start(plan[0].card)
 
     def slow() -> dict[str, int]:
-        assert show_status(study, home, as_json=True) == 1
+        assert show_status(study, home, as_json=True) == 3
         arm: dict[str, int] = json.loads(capsys.readouterr().out)["arms"]["slow"]
         return arm
 
@@ -376,16 +376,16 @@ def test_a_run_that_diverges_looks_failed_everywhere(
     monkeypatch.setattr(ray_driver, "ray_session", lambda *args: nullcontext([]))
     monkeypatch.setattr(ray_driver, "fit", fit_here)
     study = tiny(arms={"calm": setting(lr=1e-3), "wild": setting(lr=1e6, learning_starts=0)})
-    assert run_studies([study], home) == 1
+    assert run_studies([study], home) == 3
     said = capsys.readouterr().out
     (line,) = [line for line in said.splitlines() if line.startswith("failed: ")]
     assert line.startswith("failed: tiny / wild s0: diverged: train/")
     assert "at step 200; every value must be finite" in line
     assert re.search(r"wild +0 of 1 +- *$", said, re.MULTILINE)
 
-    assert show_status(study, home) == 1
+    assert show_status(study, home) == 3
     assert line in capsys.readouterr().out.splitlines()
-    assert show_status(study, home, as_json=True) == 1
+    assert show_status(study, home, as_json=True) == 3
     told = json.loads(capsys.readouterr().out)
     assert (told["arms"]["wild"]["failed"], told["arms"]["wild"]["finished"]) == (1, 0)
     assert told["errors"] == {"tiny / wild s0": line.removeprefix("failed: tiny / wild s0: ")}
@@ -398,10 +398,10 @@ def test_a_run_that_diverges_looks_failed_everywhere(
     assert not list(tracker.client.search_model_versions(f"run_id = '{wild.ref}'"))
     assert {row.step for row in tracker.rows([wild.ref])} == {0}
 
-    assert export_study(study, home / "out", home) == 1
+    assert export_study(study, home / "out", home) == 3
     table = pq.read_table(home / "out" / "tiny.runs.parquet").to_pandas().set_index("arm")
     assert table.status.to_dict() == {"calm": "finished", "wild": "failed"}
-    assert run_studies([study], home) == 1  # the same settings, the same end
+    assert run_studies([study], home) == 3  # the same settings, the same end
     assert line in capsys.readouterr().out.splitlines()
 
 
@@ -458,10 +458,11 @@ def test_a_server_that_is_not_mlflow(
     assert message.count("\n") == 1
 
 
-@pytest.mark.parametrize(("done", "code"), [(0, 1), (1, 1), (2, 0)])
+@pytest.mark.parametrize(("done", "code"), [(0, 3), (1, 3), (2, 0)])
 def test_the_status_as_json_has_the_exit_code_of_the_table(
     done: int, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    (tmp_path / "mlflow.db").touch()
     tracker = MemoryTracker(study_card(tiny()), [])
     for item in plan()[:done]:
         tracker.start(item.card).finish("finished")
@@ -477,7 +478,7 @@ def test_the_status_as_json_has_the_exit_code_of_the_table(
 
 
 def test_the_status_before_anything_ran(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert show_status(tiny(), tmp_path) == 1
+    assert show_status(tiny(), tmp_path) == 3
     assert capsys.readouterr().out.splitlines()[1].split() == ["slow", "1", "0", "0", "0", "0", "1", "0"]
     assert list(tmp_path.iterdir()) == []
 
@@ -595,7 +596,7 @@ def test_run_skip_fail_and_retry(home: Path, cluster: None, capsys: pytest.Captu
     blocked.parent.mkdir()
     blocked.touch()  # a file where the checkpoints of `slow` should go
 
-    assert run_studies([study], home) == 1
+    assert run_studies([study], home) == 3
     said = capsys.readouterr()
     assert f"failed: {study.name} / slow s0: " in said.out
     assert str(blocked) in said.out
@@ -606,7 +607,7 @@ def test_run_skip_fail_and_retry(home: Path, cluster: None, capsys: pytest.Captu
     assert {arm: run.status for arm, run in before.items()} == {"slow": "failed", "fast": "finished"}
     tags = tracker.client.get_run(before["slow"].ref).data.tags
     assert str(blocked) in tags["error"]
-    assert show_status(study, home) == 1
+    assert show_status(study, home) == 3
 
     blocked.unlink()
     assert run_studies([study], home) == 0

@@ -1,8 +1,11 @@
 """Declared outputs are the same bytes wherever results are equal, and the last line of `make repro` says so."""
 
+import importlib
+import inspect
 import os
 import shutil
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,7 +22,7 @@ from reports.data.schema import MADE, METRICS, PLACE, RUNS, TRANSFER
 from reports.pages import build
 from rhmc.envs import coverage
 from tests.memory_tracker import MemoryTracker
-from tests.pipelines.support import setting, tiny
+from tests.pipelines.support import run_rhmc, setting, tiny
 
 ROOT = Path(__file__).parents[3]
 STAGES: dict[str, Any] = YAML(typ="safe").load((ROOT / "dvc.yaml").read_text(encoding="utf-8"))["stages"]
@@ -123,6 +126,7 @@ def test_no_other_table_has_room_for_how_it_was_made() -> None:
 
 # The last steps of `make repro`
 
+COUNT = "verdicts --profile quick"
 RHMC = """#!/bin/sh
 echo "$*" >> calls
 case "$1" in
@@ -138,11 +142,13 @@ def clone(tmp_path: Path) -> Path:
     """The makefile, with programs that only note how they were called; a profile that has run."""
     for name in ("Makefile", "requirements.lock", "pyproject.toml"):
         shutil.copy(ROOT / name, tmp_path)
+    (tmp_path / ".ci").mkdir()
+    (tmp_path / ".ci" / "dvc_repro.py").write_text("exit(int(open('pipeline').read()))\n")
     tools = tmp_path / ".venv" / "bin"
     tools.mkdir(parents=True)
-    for name, text in (("rhmc", RHMC), ("dvc", '#!/bin/sh\nexit "$(cat pipeline)"\n')):
-        (tools / name).write_text(text)
-        (tools / name).chmod(0o755)
+    (tools / "rhmc").write_text(RHMC)
+    (tools / "rhmc").chmod(0o755)
+    (tools / "python").symlink_to(sys.executable)
     (tmp_path / ".venv" / ".ready").touch()
     (tmp_path / "pipeline").write_text("0")
     (tmp_path / "verdict").write_text("0")
@@ -166,22 +172,53 @@ def repro(clone: Path) -> Said:
 
 def test_the_page_is_made_where_it_is_missing_or_old(clone: Path) -> None:
     page, made = clone / "results/quick/index.html", clone / "results/quick/runs/reach.made.parquet"
-    assert repro(clone).calls == ["report --profile quick"]
+    assert repro(clone).calls == ["report --profile quick", COUNT]
     assert page.exists()
     made.touch()
     for path, time in ((made, 10), (made.parent, 10), (page, 20)):
         os.utime(path, (time, time))
-    assert repro(clone).calls == []
+    assert repro(clone).calls == [COUNT]
     os.utime(made, (30, 30))
-    assert repro(clone).calls == ["report --profile quick"]
+    assert repro(clone).calls == ["report --profile quick", COUNT]
 
 
-@pytest.mark.parametrize(("verdict", "code"), [(0, 0), (1, 0), (2, 2)])
+@pytest.mark.parametrize(("verdict", "code"), [(0, 0), (4, 0), (1, 2), (2, 2)])
 def test_the_last_line_is_on_the_published_results(clone: Path, verdict: int, code: int) -> None:
     assert repro(clone).last.startswith("MLflow UI: ")
     (clone / "results" / "published" / "quick").mkdir(parents=True)
     (clone / "verdict").write_text(str(verdict))
-    assert repro(clone) == (code, "the verdict", ["verify --runs results/quick/runs --profile quick"])
+    assert repro(clone) == (code, "the verdict", [COUNT, "verify --runs results/quick/runs --profile quick"])
+
+
+def test_dvc_says_all_but_its_hint(tmp_path: Path) -> None:
+    hint = "Use `dvc push` to send your updates to remote storage."
+    assert f'ui.write("{hint}")' in inspect.getsource(importlib.import_module("dvc.commands.repro"))
+    (tmp_path / "dvc").mkdir()
+    (tmp_path / "dvc" / "__init__.py").touch()
+    (tmp_path / "dvc" / "cli.py").write_text(
+        f"def main(words):\n    print('one', words)\n    print({hint!r})\n    return 3\n"
+    )
+    command = [sys.executable, ROOT / ".ci" / "dvc_repro.py", "--dry"]
+    env = os.environ | {"PYTHONPATH": str(tmp_path)}
+    done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (3, "one ['repro', '--dry']\n", "")
+
+
+@pytest.mark.parametrize(("name", "said"), [("report", f"stage {len(STAGES)} of {len(STAGES)}: report\n"), ("x", "")])
+def test_a_stage_says_which_it_is(
+    name: str, said: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setenv("DVC_STAGE", name)
+    assert run_rhmc("profile") == 0
+    assert capfd.readouterr().err == said
+
+
+def test_each_stage_begins_with_what_says_which_it_is() -> None:
+    first = {
+        name: stage["cmd"][0] if isinstance(stage["cmd"], list) else stage["cmd"] for name, stage in STAGES.items()
+    }
+    assert {command.split()[1] for command in first.values()} == {"profile", "fingerprint"}
 
 
 def test_a_pipeline_that_stopped_is_not_verified(clone: Path) -> None:

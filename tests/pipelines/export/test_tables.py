@@ -8,9 +8,10 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
-from pipelines.export.pace import estimated, paces
+from pipelines.export.pace import estimated, estimated_search, paces
 from pipelines.export.tables import export_study, write_tables
 from pipelines.specs.readings import Cell, Plan
+from pipelines.specs.search import Search
 from pipelines.specs.study import RunSpec, Study
 from pipelines.tracking.plan import Item, items, study_card
 from pipelines.workspace.provenance import Host, host
@@ -192,7 +193,39 @@ def test_the_hours_of_a_study_follow_the_pace_of_finished_runs(tracker: MemoryTr
     assert estimated(study, tmp_path) == ""
 
 
-@pytest.mark.parametrize(("done", "code"), [(1, 1), (2, 0)])
+SEARCH = """
+question: Which?
+base: {env: {kind: navigation}, algo: {kind: iql, encoder: mlp}}
+arms:
+  IQL: {space: {lr: {low: 1e-4, high: 1e-2}}}
+  other: {algo: {kind: KIND, encoder: mlp}, space: {lr: {low: 1e-4, high: 1e-2}}}
+trials: 5
+seeds: 2
+steps: 54_000
+"""
+
+
+@pytest.mark.parametrize(("pruner", "end"), [("none", ")"), ("median", "less where trials are pruned")])
+def test_the_hours_of_a_search_are_those_of_its_whole_budget(
+    tracker: MemoryTracker, tmp_path: Path, pruner: str, end: str
+) -> None:
+    for item in plan():
+        log(tracker, item)
+    write_tables(tiny(), plan(), tracker, tmp_path)
+    (tmp_path / "s.yaml").write_text(SEARCH.replace("KIND", "iql") + f"pruner: {{kind: {pruner}}}\n")
+    said = estimated_search(Search.load(tmp_path / "s.yaml"), tmp_path)
+    assert said.startswith("about 2.0 hours of one trial at a time, 1.0 of 2, at the median pace")
+    assert said.endswith(end)
+
+
+def test_a_method_without_runs_has_no_hours(tracker: MemoryTracker, tmp_path: Path) -> None:
+    log(tracker, plan()[0])
+    write_tables(tiny(), plan(), tracker, tmp_path)
+    (tmp_path / "s.yaml").write_text(SEARCH.replace("KIND", "vdn"))
+    assert estimated_search(Search.load(tmp_path / "s.yaml"), tmp_path) == ""
+
+
+@pytest.mark.parametrize(("done", "code"), [(1, 3), (2, 0)])
 def test_half_a_study_is_written_and_has_its_exit_code(
     done: int,
     code: int,
@@ -211,7 +244,7 @@ def test_half_a_study_is_written_and_has_its_exit_code(
 
 
 def test_nothing_logged_yet(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert export_study(tiny(), tmp_path / "out", tmp_path / "none") == 1
+    assert export_study(tiny(), tmp_path / "out", tmp_path / "none") == 3
     assert "2 of 2 runs are not finished" in capsys.readouterr().err
     values, table = read(tmp_path / "out")
     assert (list(values), len(values)) == (METRICS.names, 0)

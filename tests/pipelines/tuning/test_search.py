@@ -28,6 +28,7 @@ from pipelines.execution import ray_driver
 from pipelines.execution.finite import DivergedError
 from pipelines.execution.progress import PlainBoard
 from pipelines.execution.seed_group import Seeds
+from pipelines.execution.tally import Training
 from pipelines.execution.trainable import ending
 from pipelines.specs.search import EVAL_SEED, FIRST_SEED, Dimension, Search
 from pipelines.specs.study import Setting, Study, StudyError
@@ -37,7 +38,7 @@ from pipelines.tuning import ray_workers
 from pipelines.tuning.best_params import file_name, winner_yaml
 from pipelines.tuning.ray_workers import Failed
 from pipelines.tuning.search_plots import plots
-from pipelines.tuning.search_run import Drive, TrialLog, results, run_search, search_card, show_search
+from pipelines.tuning.search_run import Drive, TrialLog, results, run_search, search_card, show_search, tally
 from pipelines.tuning.trials import ArmStudy, look, open_storage
 from pipelines.workspace.work_folder import Home, StoreError
 from rhmc.training.trainer import Trainer
@@ -278,10 +279,14 @@ def test_arms_may_include_one_space() -> None:
 
 def test_a_study_is_no_search_and_a_search_no_study() -> None:
     load()
-    with pytest.raises(StudyError, match=r"^studies/search_x.yaml:1:1: an arm has a space: a search, .* is no study$"):
+    with pytest.raises(
+        StudyError,
+        match=r"^studies/search_x.yaml:1:1: .*: a search, for `rhmc search check`, .* is no study$",
+    ):
         Study.load("studies/search_x.yaml")
     with pytest.raises(
-        StudyError, match=r"coverage.yaml:1:1: no arm has a space: a study, for `rhmc study`, is no search$"
+        StudyError,
+        match=r"coverage.yaml:1:1: no arm has a space: a study, for `rhmc study check`, .* is no search$",
     ):
         Search.load(ROOT / "studies" / "coverage.yaml")
 
@@ -433,6 +438,24 @@ def test_every_arm_is_tried_as_often_and_all_advance_together(tmp_path: Path) ->
     assert all({"IQL", "VDN"} == set(order[k : k + 2]) for k in range(0, 10, 2))
     assert {arm_study.left for arm_study in world.arm_studies()} == {0}
     assert world.launch().trained == 0
+
+
+def test_the_board_counts_the_trials_of_all_arms(tmp_path: Path) -> None:
+    world, queue = World(load(), tmp_path), []
+    make = TrialLog.__init__
+
+    def counted(self: TrialLog, search: Search, tracker: Any, display: Any) -> None:
+        make(self, search, tracker, display)
+        queue.append(tally(search, world.arm_studies()))
+        assert queue[-1].waiting == {Training("IQL", 600): 5, Training("VDN", 600): 5}
+        display.expect(queue[-1])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(TrialLog, "__init__", counted)
+        world.launch(size=2)
+    assert world.out.getvalue().splitlines()[0] == "0 of 10 trials finished"
+    assert (str(queue[0]), queue[0].left()) == ("10 of 10 trials finished", 0)
+    assert str(tally(world.search, world.arm_studies())) == "10 of 10 trials finished"
 
 
 def test_a_trial_is_judged_by_the_mean_of_its_seeds(tmp_path: Path) -> None:
@@ -816,7 +839,7 @@ def test_a_file_that_is_no_database_is_one_line(tmp_path: Path) -> None:
 
 
 def test_status_before_anything_ran_makes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert show_search(load(), tmp_path / "work") == 1
+    assert show_search(load(), tmp_path / "work") == 3
     assert capsys.readouterr().out == "search_x (quick): nothing has been tried yet\n"
     assert not (tmp_path / "work").exists()
 
@@ -829,7 +852,7 @@ def test_status_is_done_where_every_trial_is_closed(
     monkeypatch.setattr("pipelines.tuning.search_run.opened", lambda place, write: nullcontext(world.storage))
     best = world.arm_studies()[0].best()
     assert best is not None
-    for trials, code, missing in ((5, 0, 0), (6, 1, 1), (3, 0, 0)):
+    for trials, code, missing in ((5, 0, 0), (6, 3, 1), (3, 0, 0)):
         assert show_search(load(GOOD, "quick", f"trials={trials}"), tmp_path) == code
         out = capsys.readouterr().out
         (row,) = (line.split() for line in out.splitlines() if line.split()[:2] == ["IQL", str(trials)])
@@ -920,7 +943,7 @@ def test_a_killed_and_interrupted_search_ends_as_one_that_was_not(
     process.kill()
     process.wait()
     assert all_end(process.pid, "ray::Worker")  # else one saves a point, which `interrupt` takes for the next launch's
-    assert show_search(search, work) == 1
+    assert show_search(search, work) == 3
     threading.Thread(target=interrupt, args=(work,)).start()
     assert run_search(search, work, work / "out") == 130
     said = capsys.readouterr().out

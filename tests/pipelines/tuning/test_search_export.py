@@ -104,7 +104,7 @@ def test_the_plan_is_kept_where_trials_failed_or_are_missing(
     world = World(load(), tmp_path, few.storage)
     world.arm_studies()[1].ask()
     code, table = exported(world, tmp_path)
-    assert code == 1
+    assert code == 3
     assert table["state"].tolist() == ["failed"] * 3 + ["missing"] * 2 + ["complete"] * 3 + ["partial", "missing"]
     open_ = table[~table["state"].isin(["complete"])]
     assert open_["value"].isna().all()
@@ -128,7 +128,7 @@ def test_trials_of_other_code_are_left_out_and_counted(tmp_path: Path, capsys: p
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pipelines.specs.search.code_id", lambda *place: "0ther")
         code, table = exported(world, tmp_path)
-    assert (code, set(table["state"])) == (1, {"missing"})
+    assert (code, set(table["state"])) == (3, {"missing"})
     said = capsys.readouterr().err.splitlines()
     assert said[:2] == [f"search_x (quick), {a}: 5 trials of other settings or code left out" for a in ("IQL", "VDN")]
 
@@ -144,7 +144,7 @@ def test_several_searches_before_anything_ran(tmp_path: Path, capfd: pytest.Capt
     load()
     Path("studies/search_y.yaml").write_text(GOOD)
     code, out, err = rhmc(capfd, "studies/search_x.yaml", "studies/search_y.yaml", "--profile", "paper")
-    assert (code, out) == (1, "")
+    assert (code, out) == (3, "")
     assert err.splitlines() == [
         "search_x (paper): 18 of 18 trials are neither complete nor pruned",
         "search_y (paper): 18 of 18 trials are neither complete nor pruned",
@@ -158,7 +158,7 @@ def test_several_searches_before_anything_ran(tmp_path: Path, capfd: pytest.Capt
 def test_one_search_to_another_folder(capfd: pytest.CaptureFixture[str]) -> None:
     load()
     said = rhmc(capfd, "studies/search_x.yaml", "--out", "o", "--set", "trials=1")
-    assert said.code == 1
+    assert said.code == 3
     assert said.err.splitlines()[-1] == "next:  rhmc report --study studies/search_x.yaml --runs o"
     assert pq.read_metadata(f"o/{NAME}").num_rows == 2
 

@@ -303,10 +303,10 @@ def test_faulty_tables_leave_the_old_report(few: Path, tmp_path: Path, capsys: p
     out = tmp_path / "out"
     assert len(build(few, out, "quick").files) == len(content(out))
     before = content(out)
-    assert write_report(few, out, "paper") == 2
+    assert write_report(few, out, "paper") == "refused"
     lines = capsys.readouterr().err.splitlines()
     assert "made with profile 'quick', and this report is of 'paper'" in lines[0]
-    assert write_report(tmp_path / "no", out) == 2
+    assert write_report(tmp_path / "no", out) == "refused"
     assert content(out) == before
 
 
@@ -357,10 +357,10 @@ def test_tables_of_an_older_version_are_set_aside_and_the_page_says_so(
     folder = tmp_path / "runs"
     shutil.copytree(runs, folder)
     said = "made by an older version and set aside, until `rhmc study run` and `rhmc export` make them anew"
-    assert write_report(folder, tmp_path / "out") == 0
+    assert write_report(folder, tmp_path / "out") == "whole"
     assert said not in capsys.readouterr().err + (tmp_path / "out" / "index.md").read_text()
     pd.read_parquet(folder / "coverage.runs.parquet").to_parquet(folder / "coverage.runs.parquet")
-    assert write_report(folder, tmp_path / "out") == 0
+    assert write_report(folder, tmp_path / "out") == "whole"
     assert capsys.readouterr().err == f"note: Tables of coverage: {said}.\n"
     assert f"**Tables of coverage: {said}.**" in (tmp_path / "out" / "index.md").read_text()
     assert f"Tables of coverage: {said.replace('`', '')}." in (tmp_path / "out" / "index.html").read_text()

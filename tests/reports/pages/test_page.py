@@ -204,7 +204,7 @@ def test_one_study(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arms = {"one": noisy(67), "two": noisy(63), "three": noisy(50)}
     runs = write(tmp_path / "runs", study("reach", arms, points=4), study("other", {"x": noisy(1)}), yardsticks())
     out = tmp_path / "out"
-    assert write_report(runs, out, study="reach") == 0
+    assert write_report(runs, out, study="reach") == "whole"
     assert f"start with {out / 'index.html'}" in capsys.readouterr().out
     names = {str(path.relative_to(out)) for path in out.rglob("*") if path.is_file()}
     assert {"index.html", "index.md", "figures/curves_reach.pdf", "tables/pairs_reach.tex"} <= names
@@ -213,7 +213,7 @@ def test_one_study(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "Study reach, profile quick" in text
     assert "Pairs of arms, study reach" in text
     assert "The paper's claims" not in text
-    assert write_report(runs, out, study="raech") == 2
+    assert write_report(runs, out, study="raech") == "refused"
     assert "no table of study 'raech' here (there are other, reach)" in capsys.readouterr().err
 
 

@@ -54,7 +54,7 @@ def test_a_search_changes_nothing_of_the_studies(runs: Path, tmp_path: Path) -> 
 
 
 def test_a_report_of_one_search(runs: Path, tmp_path: Path) -> None:
-    assert write_report(runs, tmp_path / "out", "quick", "search_x") == 0
+    assert write_report(runs, tmp_path / "out", "quick", "search_x") == "whole"
     text = (tmp_path / "out" / "index.md").read_text()
     assert text.startswith("# Search search_x, profile quick")
     assert "reach" not in text
@@ -64,10 +64,10 @@ def test_a_report_of_one_search(runs: Path, tmp_path: Path) -> None:
 
 def test_a_folder_with_searches_alone(runs: Path, tmp_path: Path) -> None:
     shutil.copytree(runs, tmp_path / "alone", ignore=shutil.ignore_patterns("reach*"))
-    assert write_report(tmp_path / "alone", tmp_path / "out") == 0
+    assert write_report(tmp_path / "alone", tmp_path / "out") == "whole"
     assert set(content(tmp_path / "out")) > TABLES | FIGURE
 
 
 def test_arms_of_any_name(tmp_path: Path) -> None:
     folder = write_trials(tmp_path / "runs", trials({name: [60.0 + n, 61.0] for n, name in enumerate(NAMES)}))
-    assert write_report(folder, tmp_path / "out", "quick", "search_x") == 0
+    assert write_report(folder, tmp_path / "out", "quick", "search_x") == "whole"
