@@ -217,3 +217,15 @@ def test_a_launch_of_an_arm_is_done_when_that_arm_is(
     assert "next:  rhmc study run studies/tiny.yaml --profile quick   (continues)" in said
     found = standing_of(tiny(), Home(home))
     assert (found.arms["fast"]["finished"], found.arms["slow"]["missing"], found.finished) == (1, 1, False)
+
+
+def test_a_run_that_failed_leaves_half_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, template: Path) -> None:
+    home = fresh(tmp_path / "work", template)
+
+    def here(studies: object, recorders: run.Recorders, place: Home, interrupts: object) -> None:
+        first, *_ = recorders.todo()
+        recorders.start(first.key)
+        recorders.failed(first.key, "boom", "Traceback")
+
+    monkeypatch.setattr(run, "train", here)
+    assert run_studies([tiny()], home) == 3
