@@ -13,12 +13,13 @@ from typing import Any, NotRequired, TypedDict
 from filelock import Timeout
 from ray.tune import Trainable
 
-from pipelines.execution.cluster import check_code, here
+from pipelines.execution.cluster import check_code, check_plugins, here
 from pipelines.execution.finite import DivergedError, check, defined
 from pipelines.execution.seed_group import Seeds
 from pipelines.specs.study import RunSpec
 from pipelines.tracking.policy import FILE, SPEC, Saved
 from pipelines.workspace.best_effort import EPISODE, WHY_NOT
+from pipelines.workspace.own_packages import take
 from pipelines.workspace.work_folder import Checkpoints, StoreError, one_line, save_atomically, without_replay
 from rhmc.learning.learner import Learners
 from rhmc.training.trainer import Trainer
@@ -37,6 +38,7 @@ class Job(TypedDict):
     checkpoint_every: int  # points of the grid
     stop: str  # a file: once it exists, the run saves itself at the next point and ends
     animate: NotRequired[bool]  # leave an animation of an episode beside the policy
+    imports: NotRequired[dict[str, str]]  # modules that the study's user has named, each with its package's folder
 
 
 class RunTrainable(Trainable):
@@ -62,6 +64,7 @@ class RunTrainable(Trainable):
         self.seconds = 0.0
         self.reported = self.saved = 0  # points told to the driver; points in the newest checkpoint
         self.ended: dict[str, Any] = {}  # why there is nothing to train
+        take(job.get("imports", {}))
         if self.stop_file.exists():
             self.ended = ending(stopped=True)
             return
@@ -90,6 +93,7 @@ class RunTrainable(Trainable):
     def make_trainer(self) -> Trainer | Seeds:
         """The trainings of the job, untrained."""
         spec = RunSpec.model_validate_json(self.job["spec"])
+        check_plugins(spec, self.job["key"])
         return Trainer(spec.env, spec.algo, spec.trainer, spec.seed)
 
     def step(self) -> dict[str, Any]:

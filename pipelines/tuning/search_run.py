@@ -29,6 +29,7 @@ from pipelines.tuning.trials import OBJECTIVE, ArmStudy, BaseStorage, TrialReque
 from pipelines.workspace.addresses import without_password
 from pipelines.workspace.best_effort import decoration
 from pipelines.workspace.errors import InputError, visible
+from pipelines.workspace.own_packages import named
 from pipelines.workspace.terminal import terminal
 from pipelines.workspace.work_folder import Checkpoints, Home, StoreError
 from reports.data.escaping import markdown, prose
@@ -219,6 +220,7 @@ class Drive:
                 "folder": str(folder),
                 "checkpoint_every": self.search.resources.checkpoint_every,
                 "stop": str(self.stop.path),
+                "imports": named(),
             }
         )
 
