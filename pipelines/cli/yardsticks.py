@@ -141,7 +141,8 @@ def everything(
 
 def _show(found: list["Scored"]) -> None:
     """All scores, task by task."""
-    from pipelines.export.yardsticks import SEM_OF, TASKS
+    from pipelines.export.yardsticks import TASKS
+    from rhmc.yardsticks import offered
     from rhmc.yardsticks.scores import names
 
     rows = sorted(
@@ -156,7 +157,9 @@ def _show(found: list["Scored"]) -> None:
         for one in found
         for name, score in one.scores.items()
     )
-    cells = [[task, name, f"{score[SEM_OF[kind]]:.2f}", f"{score['sem']:.2f}"] for *_, task, name, score, kind in rows]
+    cells = [
+        [task, name, f"{score[offered(kind).score]:.2f}", f"{score['sem']:.2f}"] for *_, task, name, score, kind in rows
+    ]
     table(["task", "policy", "coverage or return", "sem"], cells, numbers=["coverage or return", "sem"])
 
 

@@ -6,7 +6,7 @@ bundle, says which modules it needs. It is no user: what it names and nobody els
 """
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -18,14 +18,16 @@ from pipelines.specs.document import Fault, Node, choices, nearest, show
 from pipelines.specs.safe_names import simple
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.own_packages import NotImportedError, bring, load, load_taken, names, top_of
-from rhmc.algorithms import ALGORITHMS
-from rhmc.envs import ENVS, EnvConfig
+from rhmc.algorithms import ALGORITHMS, Method
+from rhmc.envs import ENVS, EnvConfig, Task
+from rhmc.yardsticks import BOUNDS, OFFERS, POLICIES
 
 PROJECT = "rhmc"  # whose kinds are always there
 GROUPS = ("rhmc.methods", "rhmc.tasks")  # of entry points
 VARIABLE = "RHMC_IMPORTS"  # names of modules, with commas between
 TABLES: dict[str, dict[str, Any]] = {"env": ENVS, "algo": ALGORITHMS}  # by section of a study
 WORDS = {"env": "task", "algo": "method"}
+FILLED: list[dict[str, Any]] = [ENVS, ALGORITHMS, OFFERS, POLICIES, BOUNDS]  # what a module may register in
 
 
 class UnnamedError(InputError):
@@ -51,6 +53,12 @@ def pages(kinds: Mapping[str, Any]) -> tuple[str, ...]:
     entries = [TABLES[section][kind] for section, kind in kinds.items() if kind in TABLES[section]]
     found = {entry.config.__module__ for entry in entries}
     return tuple(sorted(module for module in found if top_of(module) != PROJECT))
+
+
+def finals() -> dict[str, str]:
+    """The final values that come first, as metrics and in words: of every task that is registered now."""
+    names = dict.fromkeys(name for offers in OFFERS.values() for name in offers.measures)
+    return {f"final/{name}": name.replace("_", " ") for name in names}
 
 
 # Who names a module: a study
@@ -81,26 +89,29 @@ def _brought(module: str, folders: Iterable[Path]) -> str:
 
 def _all_or_nothing(act: Callable[[], None], module: str) -> str:
     """Let a module register what it has; the tables are as they were where something is wrong with it."""
-    before = {section: dict(table) for section, table in TABLES.items()}
+    before = [dict(table) for table in FILLED]
+    known = {section: set(table) for section, table in TABLES.items()}
     try:
         act()
-        text = next(_unfit(before, module), "")
+        text = next(_unfit(known, module), "")
     except NotImportedError as error:
         text = f"{error}{nearest(module, error.near)}"
     if text:
-        for section, table in TABLES.items():
+        for table, old in zip(FILLED, before, strict=True):
             table.clear()
-            table.update(before[section])
+            table.update(old)
     return text
 
 
-def _unfit(before: Mapping[str, Mapping[str, Any]], module: str) -> Iterator[str]:
+def _unfit(known: Mapping[str, Collection[str]], module: str) -> Iterator[str]:
     """The faults of what was registered since; a module that was imported earlier has registered it then."""
-    new = [(s, kind, entry) for s, table in TABLES.items() for kind, entry in table.items() if kind not in before[s]]
+    new = [(s, kind, entry) for s, table in TABLES.items() for kind, entry in table.items() if kind not in known[s]]
     for section, kind, entry in new:
-        fields = getattr(entry.config, "model_fields", {})
         what = f"registers the {WORDS[section]} {show(kind)}"
-        if not simple(kind):
+        fields = getattr(getattr(entry, "config", None), "model_fields", {})
+        if not isinstance(entry, Task if section == "env" else Method):
+            yield f"{what}, which is no {'rhmc.envs.Task' if section == 'env' else 'rhmc.algorithms.Method'}"
+        elif not simple(kind):
             yield f"{what}; a kind is named with letters, digits, '-' and '_' only"
         elif not issubclass(entry.config, EnvConfig if section == "env" else BaseModel):
             yield f"{what}, whose configuration is no {'rhmc.envs.EnvConfig' if section == 'env' else 'pydantic model'}"

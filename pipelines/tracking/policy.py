@@ -111,7 +111,13 @@ def save(path: Path, saved: Saved) -> None:
     Raises:
         StoreError: the file cannot be written.
     """
-    save_atomically(path, {SPEC: saved.spec.canonical(), "algorithm": without_replay(saved.algorithm)})
+    save_atomically(path, {SPEC: saved.spec.canonical(), "algorithm": acting(saved.spec.algo.kind, saved.algorithm)})
+
+
+def acting(method: str, state: State) -> State:
+    """The part of a method's state that acting needs, as the method says; it may lack what learning keeps."""
+    says = ALGORITHMS[method].acts_on
+    return says(state) if says else without_replay(state)
 
 
 def settings(config: Path) -> tuple[RunSpec, str]:

@@ -29,6 +29,7 @@ class Method(NamedTuple):
     config: type[Any]
     build: Callable[..., "Algorithm"]
     about: About
+    acts_on: Callable[[State], State] | None = None  # the part of a state that acting needs; None: all but replays
 
 
 ALGORITHMS: dict[str, Method] = {}  # by kind; everything that lists methods reads this table
