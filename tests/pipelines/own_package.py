@@ -90,6 +90,19 @@ TASK = (
     .replace('kind: Literal["toy"] = "toy"', 'kind: Literal["ring"] = "ring"\n    observation: str = "paper"')
     + '\n\nregister_task("ring", Task(Config, sys.modules[__name__]))\n'
 )
+OFFERS = """
+
+def stay(cfg: Config, state: State, rng: Generator) -> Tensor:
+    return torch.zeros(state.bearing.shape[:2], dtype=torch.int64)
+
+
+def paint(brush: Any, scene: Any) -> None:
+    for place, bearing in enumerate(scene.state.bearing[0, :, 0].tolist()):
+        brush.disc(bearing / HEADINGS, place / 4, 0.1, (28, 126, 62))
+
+
+register_offers("ring", Offers(("return", "faced"), "share of targets faced", "faced", {"stay": stay}, paint))
+"""
 STUDY = """\
 question: Does a package of one's own go all the way?
 imports: [bandits]
@@ -105,13 +118,17 @@ steps: 600
 """
 
 
-def write(folder: Path, name: str = NAME) -> Path:
-    """The package in a folder: two pages, and a module that nothing imports."""
+def write(folder: Path, name: str = NAME, *, offers: bool = False) -> Path:
+    """The package in a folder: two pages, and a module that nothing imports.
+
+    offers: the task also has a policy without learning, a headline and a painter.
+    """
     package = folder / name
     package.mkdir(parents=True)
     (package / "__init__.py").write_text("from . import methods, tasks\n")
     (package / "methods.py").write_text(METHOD)
-    (package / "tasks.py").write_text(TASK)
+    more = "from rhmc.yardsticks import Offers, register_offers\nfrom typing import Any\n" if offers else ""
+    (package / "tasks.py").write_text(more + TASK + OFFERS * offers)
     (package / "beside.py").write_text("SPARE = 1\n")
     return package
 
@@ -119,22 +136,22 @@ def write(folder: Path, name: str = NAME) -> Path:
 @contextmanager
 def untouched() -> Iterator[None]:
     """What is imported and registered meanwhile is forgotten afterwards."""
-    tables = {section: dict(table) for section, table in plugins.TABLES.items()}
+    tables = [dict(table) for table in plugins.FILLED]
     before = set(sys.modules)
     kept = [dict(one) for one in (own_packages._named, own_packages._waiting, own_packages._finder.folders)]
     plugins._of_variable.cache_clear()
     try:
         yield
     finally:
-        for section, table in plugins.TABLES.items():
+        for table, old in zip(plugins.FILLED, tables, strict=True):
             table.clear()
-            table.update(tables[section])
+            table.update(old)
         tops = {top_of(name) for name in own_packages._named} - {top_of(name) for name in kept[0]}
         for name in set(sys.modules) - before:
             if top_of(name) in tops:
                 del sys.modules[name]
         live = (own_packages._named, own_packages._waiting, own_packages._finder.folders)
-        for one, old in zip(live, kept, strict=True):
+        for one, earlier in zip(live, kept, strict=True):
             one.clear()
-            one.update(old)
+            one.update(earlier)
         plugins._of_variable.cache_clear()
