@@ -88,7 +88,9 @@ def pack(study: Study, out: Path, home: Path, *, values_only: bool = False) -> P
         code = {item.card.fingerprint: dict(item.card.modules) for item in plan}
         adopted = {run.key: run.adopted for run in tracker.recorded() if run.adopted} if tracker else {}
         adopted = {item.key: adopted[item.key] for item in plan if item.key in adopted}
-        about = Manifest(format=FORMAT, commit=commit(), plan=runs, code=code, adopted=adopted, **card._asdict())
+        needed = tuple(sorted({module for item in plan for module in item.spec.imports}))
+        fixed = {"format": FORMAT, "commit": commit(), "plan": runs, "code": code, "adopted": adopted}
+        about = Manifest.model_validate(fixed | {"imports": needed} | card._asdict())
         (folder / MANIFEST).write_text(about.model_dump_json(indent=1) + "\n", encoding="utf-8")
         _check_packed(folder, out)
         if folder != part:

@@ -17,8 +17,9 @@ from pydantic import AfterValidator, Field, Json, StringConstraints, TypeAdapter
 from pipelines.bundles import files as bundle_files
 from pipelines.bundles.files import KEY, MANIFEST, BundleError, Files
 from pipelines.specs.document import choices, nearest, show
-from pipelines.specs.study import FIELDS, PROFILES, RunSpec, arm_fault, study_fault
-from pipelines.tracking.plan import KIND, Item, flatten
+from pipelines.specs.plugins import UnnamedError, discover, unnamed
+from pipelines.specs.study import IMPORTS, PROFILES, RunSpec, arm_fault, fields, study_fault
+from pipelines.tracking.plan import KIND, Item, flat_settings, flatten
 from pipelines.tracking.policy import NO_SPEC
 from pipelines.tracking.tracker import Card
 from pipelines.workspace.work_folder import one_line
@@ -44,7 +45,6 @@ ANEW = "train its study anew with `rhmc study run`"
 ROWS = {bundle_files.RUNS: 10_000, bundle_files.POINTS: 5_000_000}  # that are read at most
 UNFOLDED = 2**26  # characters in a column of texts, each as often as it occurs
 DECODED = 2**29  # bytes of a table in memory
-SETTINGS = (*FIELDS, "seed")
 GROUPS = ("eval/", "final/", "time/", "train/")
 
 
@@ -63,7 +63,8 @@ def _among(allowed: Iterable[str], value: str) -> str:
 
 
 def _setting_fault(name: str) -> str:
-    return "" if name in SETTINGS else f"no setting of a run{nearest(name, SETTINGS)}"
+    settings = (*fields(), "seed")
+    return "" if name in settings else f"no setting of a run{nearest(name, settings)}"
 
 
 def _text_fault(text: str) -> str:
@@ -106,6 +107,7 @@ class Manifest(Frozen):
     plan: tuple[tuple[Arm, Key], ...] = ()  # every run of the study, in the bundle or not
     code: dict[Digest, dict[Module, Digest]] = Field(default_factory=dict)  # the modules of each code that made a run
     adopted: dict[Key, Text] = Field(default_factory=dict)  # runs that older code made: which, and what was compared
+    imports: tuple[Module, ...] = Field((), exclude_if=lambda modules: not modules)  # that define what its runs are
 
     @model_validator(mode="after")
     def _whole(self) -> "Manifest":
@@ -199,16 +201,25 @@ def read(files: Files) -> Told:
 def _manifest(files: Files) -> Manifest:
     content = files.read(MANIFEST)
     try:
-        form = json.loads(content).get("format")
+        written = json.loads(content)
+        form, needed = written.get("format"), written.get(IMPORTS)
     except (ValueError, AttributeError, RecursionError) as error:
         raise BundleError(f"{MANIFEST}: must be a mapping in JSON ({one_line(error)})") from error
     if type(form) is int and form != FORMAT:
         age, remedy = ("a later", "import it with that version") if form > FORMAT else ("an older", ANEW)
         raise BundleError(f"a bundle of format {form}, made by {age} version; this one reads format {FORMAT}: {remedy}")
+    if text := _unnamed(needed):
+        raise BundleError(f"{MANIFEST}: {text}")
     try:
         return Manifest.model_validate_json(content, strict=True)
     except ValidationError as error:
         raise BundleError(f"{MANIFEST}: {_first(error)}") from error
+
+
+def _unnamed(needed: Any) -> str:
+    """The packages that somebody has to name before the bundle can be understood."""
+    discover()
+    return unnamed(one for one in needed if isinstance(one, str)) if isinstance(needed, list) else ""
 
 
 def _first(error: ValidationError) -> str:
@@ -363,6 +374,8 @@ def _spec(where: str, config: str) -> RunSpec:
         spec = RunSpec.model_validate_json(config)
     except ValidationError as error:
         raise BundleError(f"{where}: config: {_first(error)}") from error
+    except UnnamedError as error:
+        raise BundleError(f"{where}: config: {error}") from error
     except NO_SPEC as error:
         raise BundleError(f"{where}: config: no settings that this code knows ({one_line(error)})") from error
     if not isinstance(spec.algo, Frozen):  # nothing but a mapping is made a configuration of its kind
@@ -370,11 +383,16 @@ def _spec(where: str, config: str) -> RunSpec:
     numbers = {name: value for name, value in flatten(spec.model_dump()).items() if isinstance(value, float)}
     if astray := [name for name, value in numbers.items() if not math.isfinite(value)]:
         raise BundleError(f"{where}: config: {astray[0]}: {numbers[astray[0]]} is not allowed; must be a finite number")
-    if not _within(json.loads(config), json.loads(spec.canonical())):
+    if not _within(_but_imports(config), _but_imports(spec.canonical())):
         raise BundleError(f"{where}: config: {show(config)} is not allowed; must be as the settings are written")
     if fault := misfit(spec.env, spec.algo):
         raise BundleError(f"{where}: config: env: {fault}")
     return spec
+
+
+def _but_imports(config: str) -> dict[str, Any]:
+    """The modules are named as they are here, and may have moved within their package."""
+    return {name: value for name, value in json.loads(config).items() if name != IMPORTS}
 
 
 def _within(part: Any, whole: Any) -> bool:
@@ -385,7 +403,7 @@ def _within(part: Any, whole: Any) -> bool:
 
 
 def _check_params(where: str, params: dict[str, str], spec: RunSpec) -> None:
-    flat = {name: str(value) for name, value in flatten(spec.model_dump(mode="json")).items()}
+    flat = {name: str(value) for name, value in flat_settings(spec).items()}
     flat = {"method": flat.pop(KIND)} | flat
     for name in ("method", "seed"):
         if name not in params:

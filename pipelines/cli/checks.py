@@ -148,7 +148,10 @@ def store(home: Home) -> Iterator[Finding]:
         yield Finding("ok", "store", f"{without_password(uri)}: nothing logged yet")
         return
     from pipelines.specs.identity import present
+    from pipelines.specs.plugins import discover
 
+    for line in discover():
+        yield Finding("note", "packages", line)
     here = present()
     yield Finding("ok", "store", f"{without_password(uri)}: {len(runs)} runs")
     for status in ("running", "interrupted", "failed"):

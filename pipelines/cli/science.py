@@ -70,8 +70,10 @@ def methods(
 ) -> None:
     """Say what every method is (Table 1), with the parameters of the networks that it builds; or one's settings."""
     from pipelines.export.methods import describe, export_methods
+    from pipelines.specs.plugins import discover
     from rhmc.algorithms import ALGORITHMS
 
+    discover()
     if kind is not None:
         if out is not None:
             raise InputError("--out: belongs to the table of all methods; leave the method out")
@@ -96,8 +98,10 @@ def tasks(
     kind: Annotated[str | None, typer.Argument(autocompletion=_tasks, help="Show the settings of this task.")] = None,
 ) -> None:
     """Say which tasks there are, with the sizes of their defaults; or one's settings."""
+    from pipelines.specs.plugins import discover
     from rhmc.envs import ENVS
 
+    discover()
     if kind is not None:
         config = _entry(ENVS, kind, "task").config
         say(f"{kind}: {_summary(config)}")

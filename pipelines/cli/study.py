@@ -138,7 +138,7 @@ def copy_shipped(
     out: Annotated[Path, typer.Option(help="Folder; made if it is not there.")] = Path("studies"),
 ) -> None:
     """Write a study of this package into a folder, with what it includes: where there is no checkout."""
-    from pipelines.specs.shipped import copy
+    from pipelines.specs.include import copy
     from pipelines.workspace.work_folder import StoreError
 
     try:

@@ -5,7 +5,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipelines.cli.common import Json, Profile, folder_option, profile_faults, say_json, table, tell
+from pipelines.cli.common import (
+    File,
+    Json,
+    Profile,
+    Sets,
+    Variant,
+    folder_option,
+    load_study,
+    profile_faults,
+    say_json,
+    table,
+    tell,
+)
 from pipelines.specs.limits import EPISODES, JOBS, SEED
 from pipelines.workspace.errors import InputError
 
@@ -114,6 +126,35 @@ def _env(kind: str, fields: Fields) -> Any:
     return cfg
 
 
+@app.command("study")
+def of_study(
+    file: File,
+    profile: Profile = "quick",
+    variant: Variant = None,
+    episodes: Episodes = 1000,
+    seed: Seed = 0,
+    out: Out = None,
+    overrides: Sets = None,
+) -> None:
+    """The tasks of a study, each once, with all that they offer but the slow policies; those of other packages too."""
+    from pipelines.export.yardsticks import Evaluation, Scored, evaluate_all, export_yardsticks
+    from rhmc.yardsticks.scores import SLOW, names
+
+    study = load_study(file, profile, overrides, variant)
+    tasks = {setting.env.model_dump_json(): setting.env for setting in study.arms.values()}.values()
+    offered = [(env, tuple(name for name in names(env.kind) if name not in SLOW)) for env in tasks]
+    for kind in dict.fromkeys(env.kind for env, policies in offered if not policies):
+        tell(f"the task '{kind}' offers no policy without learning, so it is left out")
+    wanted = [Evaluation(env, policies, episodes, seed) for env, policies in offered if policies]
+    found: list[Scored] = []
+    with folder_option(out):
+        found += evaluate_all(wanted, 1)
+        if out is not None and found:
+            tell(f"wrote {export_yardsticks(found, profile, out)}")
+    if found:
+        _show(found)
+
+
 @app.command("all")
 def everything(
     out: Annotated[Path, typer.Option(help="Folder of the tables that the report reads; made if it is not there.")],
@@ -141,12 +182,14 @@ def everything(
 
 def _show(found: list["Scored"]) -> None:
     """All scores, task by task."""
-    from pipelines.export.yardsticks import SEM_OF, TASKS
+    from pipelines.export.yardsticks import TASKS
+    from rhmc.yardsticks import offered
     from rhmc.yardsticks.scores import names
 
+    places: list[Any] = [*TASKS, *(one.evaluation.env for one in found)]
     rows = sorted(
         (
-            TASKS.index(one.evaluation.env),
+            places.index(one.evaluation.env),
             names(one.evaluation.env.kind).index(name),
             _named(one),
             name,
@@ -156,7 +199,9 @@ def _show(found: list["Scored"]) -> None:
         for one in found
         for name, score in one.scores.items()
     )
-    cells = [[task, name, f"{score[SEM_OF[kind]]:.2f}", f"{score['sem']:.2f}"] for *_, task, name, score, kind in rows]
+    cells = [
+        [task, name, f"{score[offered(kind).score]:.2f}", f"{score['sem']:.2f}"] for *_, task, name, score, kind in rows
+    ]
     table(["task", "policy", "coverage or return", "sem"], cells, numbers=["coverage or return", "sem"])
 
 
@@ -165,4 +210,6 @@ def _named(scored: "Scored") -> str:
     env: Any = scored.evaluation.env
     if env.kind == "coverage":
         return f"coverage {env.preset}, {env.agents} x {env.targets}"
-    return f"navigation {env.reward}, {env.agents}"
+    if env.kind == "navigation":
+        return f"navigation {env.reward}, {env.agents}"
+    return f"{env.kind}, {env.agents}" + (f" x {env.targets}" if "targets" in type(env).model_fields else "")

@@ -22,8 +22,10 @@ from filelock import FileLock, Timeout
 from ray.exceptions import GetTimeoutError, RayError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from pipelines.specs.identity import PACKAGE, fingerprint, folder_of
+from pipelines.specs.identity import PACKAGE, code_id, fingerprint, folder_of
+from pipelines.specs.study import RunSpec
 from pipelines.workspace.leftovers import dead, owner, remove
+from pipelines.workspace.own_packages import named, top_of
 from pipelines.workspace.work_folder import StoreError, one_line
 
 KNOCK = 5.0  # seconds to wait for a cluster to answer
@@ -157,7 +159,8 @@ def _refused(where: str, why: str) -> StoreError:
 
 def travelling(settings: dict[str, str]) -> dict[str, Any]:
     """The parts that a launch brings to every node: the code that the driver runs, and Ray's settings for workers."""
-    folders = [folder_of(name) for name in (PACKAGE, "pipelines")]
+    own = {top_of(module) for module in named()}  # packages that the user has named
+    folders = [folder_of(name) for name in (PACKAGE, "pipelines", *sorted(own))]
     return {"py_modules": [str(folder) for folder in folders], "env_vars": settings | {CODE: own_code()}}
 
 
@@ -176,6 +179,21 @@ def check_code() -> None:
     wanted = os.environ.get(CODE) or own_code()
     if own_code() != wanted:
         raise StoreError(f"node {here()} {_other_code(own_code(), wanted)}")
+
+
+def check_plugins(spec: RunSpec, key: str) -> None:
+    """In a worker: see that packages outside this project are those that the driver named the run by.
+
+    Args:
+        spec: a run.
+        key: its settings id and code id.
+
+    Raises:
+        StoreError: they are not.
+    """
+    if spec.imports and code_id(spec.algo.kind, spec.env.kind) != key.rpartition("-")[2]:
+        packages = ", ".join(sorted({top_of(module) for module in spec.imports}))
+        raise StoreError(f"node {here()} has other code of {packages} than the launch began with: launch it again")
 
 
 def _other_code(found: str, wanted: str) -> str:

@@ -11,7 +11,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pipelines.workspace.work_folder import without_replay
 from rhmc.types import Metrics, State
 
 UNDEFINED = ("train/explained",)  # a share of a variance, and a rollout's targets may all be the same
@@ -32,7 +31,7 @@ def check(point: Metrics, state: State) -> None:
 
     Args:
         point: metrics with their `step`.
-        state: of a training or of parts of it. What was kept to learn from is passed over: it shows in the metrics.
+        state: of a training or of parts of it, without what was kept to learn from: that shows in the metrics.
 
     Raises:
         DivergedError: the first value that is not, metrics before weights.
@@ -40,7 +39,7 @@ def check(point: Metrics, state: State) -> None:
     for name, value in point.items():
         if not math.isfinite(value):
             raise _diverged(name, value, point)
-    for name, tensor in astray(without_replay(state)):
+    for name, tensor in astray(state):
         raise _diverged(name, float(tensor[~torch.isfinite(tensor)][0]), point)
 
 

@@ -28,6 +28,7 @@ from pipelines.tracking.tracker import Tracker
 from pipelines.workspace.addresses import without_password
 from pipelines.workspace.errors import InputError, visible
 from pipelines.workspace.exit_codes import Exit
+from pipelines.workspace.own_packages import named
 from pipelines.workspace.provenance import Host, host
 from pipelines.workspace.terminal import terminal
 from pipelines.workspace.work_folder import Home, StoreError
@@ -264,6 +265,7 @@ def train(studies: Sequence[Study], recorders: Recorders, home: Home, interrupts
             "checkpoint_every": every[item.study],
             "stop": str(stop),
             "animate": item.key in drawn,
+            "imports": named(),
         }
         for item in recorders.todo()
     ]

@@ -4,6 +4,7 @@ The trial is idempotent: whoever starts a run again, in whatever process, contin
 own checkpoints are therefore not used.
 """
 
+import json
 import time
 import traceback
 from contextlib import suppress
@@ -13,13 +14,14 @@ from typing import Any, NotRequired, TypedDict
 from filelock import Timeout
 from ray.tune import Trainable
 
-from pipelines.execution.cluster import check_code, here
+from pipelines.execution.cluster import check_code, check_plugins, here
 from pipelines.execution.finite import DivergedError, check, defined
 from pipelines.execution.seed_group import Seeds
 from pipelines.specs.study import RunSpec
-from pipelines.tracking.policy import FILE, SPEC, Saved
+from pipelines.tracking.policy import FILE, SPEC, Saved, acting
 from pipelines.workspace.best_effort import EPISODE, WHY_NOT
-from pipelines.workspace.work_folder import Checkpoints, StoreError, one_line, save_atomically, without_replay
+from pipelines.workspace.own_packages import take
+from pipelines.workspace.work_folder import Checkpoints, StoreError, one_line, save_atomically
 from rhmc.learning.learner import Learners
 from rhmc.training.trainer import Trainer
 from rhmc.types import Metrics, State
@@ -37,6 +39,7 @@ class Job(TypedDict):
     checkpoint_every: int  # points of the grid
     stop: str  # a file: once it exists, the run saves itself at the next point and ends
     animate: NotRequired[bool]  # leave an animation of an episode beside the policy
+    imports: NotRequired[dict[str, str]]  # modules that the study's user has named, each with its package's folder
 
 
 class RunTrainable(Trainable):
@@ -62,6 +65,7 @@ class RunTrainable(Trainable):
         self.seconds = 0.0
         self.reported = self.saved = 0  # points told to the driver; points in the newest checkpoint
         self.ended: dict[str, Any] = {}  # why there is nothing to train
+        take(job.get("imports", {}))
         if self.stop_file.exists():
             self.ended = ending(stopped=True)
             return
@@ -90,6 +94,7 @@ class RunTrainable(Trainable):
     def make_trainer(self) -> Trainer | Seeds:
         """The trainings of the job, untrained."""
         spec = RunSpec.model_validate_json(self.job["spec"])
+        check_plugins(spec, self.job["key"])
         return Trainer(spec.env, spec.algo, spec.trainer, spec.seed)
 
     def step(self) -> dict[str, Any]:
@@ -127,9 +132,10 @@ class RunTrainable(Trainable):
 
     def _save(self, trainer: Trainer | Seeds) -> None:
         state = self.state()
-        check({"step": float(trainer.step)}, state["trainer"])  # the rest of it, such as statistics of rewards
+        lean = to_act(json.loads(self.job["spec"])["algo"]["kind"], state["trainer"])
+        check({"step": float(trainer.step)}, lean)  # the rest of it, such as statistics of rewards
         if trainer.done:  # also where nothing is left to train: the file that a killed worker left may be damaged
-            state["trainer"] = without_replay(state["trainer"])  # nothing more is learned from it
+            state["trainer"] = lean  # nothing more is learned from it
             kept = state["trainer"] | {SPEC: self.job["spec"]}
             save_atomically(self.checkpoints.folder / FILE, kept)
             if self.job.get("animate"):
@@ -183,6 +189,13 @@ class RunTrainable(Trainable):
         """Let go of the run."""
         self.trainer = None
         self.lock.release()
+
+
+def to_act(method: str, state: State) -> State:
+    """The state of a training, or of several seeds, without what the method keeps to learn from."""
+    if "seeds" in state:
+        return state | {"seeds": [to_act(method, one) for one in state["seeds"]]}
+    return state | {"algorithm": acting(method, state["algorithm"])}
 
 
 def learners(trainer: Trainer | Seeds) -> Learners:

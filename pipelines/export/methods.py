@@ -5,9 +5,10 @@ from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
 import torch
-from torch import Generator, Tensor, nn
+from torch import Generator, nn
 from torch.nn.modules.module import register_module_forward_hook
 
+from pipelines.specs.plugins import discover
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.work_folder import whole
 from rhmc.algorithms import ALGORITHMS
@@ -27,6 +28,7 @@ class Count(NamedTuple):
 
 def describe() -> list[dict[str, Any]]:
     """Every method in the order of the table: the fields of `About`, `parameters` per task and encoder, `defaults`."""
+    discover()
     rows = []
     for kind, method in ALGORITHMS.items():
         sizes = [
@@ -45,7 +47,8 @@ def count(kind: str, encoder: str, env: EnvConfig) -> Count:
     method = ALGORITHMS[kind]
     task = make_env(env, 1, Generator())
     with torch.random.fork_rng(devices=[]):
-        algorithm = method.build(method.config(encoder=encoder), task.spec, 1, Generator())
+        chosen = {"encoder": encoder} if "encoder" in method.config.model_fields else {}
+        algorithm = method.build(method.config(**chosen), task.spec, 1, Generator())
     used: dict[int, int] = {}
 
     def use(module: nn.Module, inputs: Any, output: Any) -> None:
@@ -57,15 +60,8 @@ def count(kind: str, encoder: str, env: EnvConfig) -> Count:
             algorithm.act(task.reset(), algorithm.carry(1), Generator(), explore=False)
     finally:
         hook.remove()
-    return Count(sum(used.values()), _learning(algorithm.state_dict()))
-
-
-def _learning(state: Any) -> int:
-    """Numbers in the networks of all learners inside a checkpoint."""
-    inner = state.values() if isinstance(state, dict) else state if isinstance(state, list) else ()
-    if isinstance(state, dict) and state.keys() == {"net", "target_net", "optimiser"}:
-        return sum(value.numel() for value in state["net"].values() if isinstance(value, Tensor))
-    return sum(map(_learning, inner))
+    learning = [value for one in algorithm.learners() for value in one.net.state_dict().values()]
+    return Count(sum(used.values()), sum(value.numel() for value in learning))
 
 
 def export_methods(out: Path) -> Path:

@@ -14,6 +14,7 @@ import pandas as pd
 import pyarrow as pa
 
 from pipelines.export.tables import write_parquet, write_tables
+from pipelines.specs.plugins import UnnamedError
 from pipelines.specs.study import RunSpec, Study
 from pipelines.tracking.plan import items, study_card
 from pipelines.workspace.errors import InputError
@@ -123,6 +124,8 @@ def _spec(row: Mapping[Any, Any]) -> RunSpec:
     name = f"{row['study']}, arm '{row['arm']}', seed {row['seed']}"
     try:
         spec = RunSpec.model_validate(json.loads(row["config"]))
+    except UnnamedError as error:
+        raise InputError(f"{name}: {error}") from error
     except (ValueError, TypeError) as error:
         raise InputError(f"{name}: its published settings are none that this code knows ({one_line(error)})") from error
     if spec.id != row["run"]:

@@ -4,6 +4,7 @@ The files are canonical: the same log gives the same bytes (sorted rows, no cloc
 of them are the same bytes wherever results are equal; how and where each run was made has a file of its own.
 """
 
+import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from pipelines.specs.plugins import pages
 from pipelines.specs.readings import Plan
 from pipelines.specs.source_file import another
 from pipelines.specs.study import Study
@@ -20,13 +22,15 @@ from pipelines.workspace.errors import InputError, visible
 from pipelines.workspace.exit_codes import Exit
 from pipelines.workspace.files import regular
 from pipelines.workspace.work_folder import Home, StoreError, lacks_memory, reason, whole, work_folder
-from reports.data.schema import MADE, METRICS, READINGS, RUNS
+from reports.data.schema import MADE, METRICS, READINGS, RUNS, TASKS
+from rhmc.yardsticks import offered
 
 
 def export_study(study: Study, out: Path, home: Path | None = None) -> int:
     """Write `<study>.parquet` (schema `METRICS`), `<study>.runs.parquet` (`RUNS`), `<study>.made.parquet` (`MADE`).
 
-    A study with readings also has `<study>.readings.parquet` (`READINGS`).
+    A study with readings also has `<study>.readings.parquet` (`READINGS`), one with tasks of other packages
+    `<study>.tasks.json`: what the report has to know of them.
     Only runs of the present plan and code are taken; `time/` metrics stay behind, but for a run's processor seconds.
 
     Args:
@@ -75,6 +79,10 @@ def write_tables(study: Study, plan: list[Item], tracker: Tracker | None, out: P
     write_parquet(out / f"{study.name}.made.parquet", MADE, sorted(made, key=lambda row: row[:4]))
     if study.readings:
         write_parquet(out / f"{study.name}.readings.parquet", READINGS, _levels(study, study.readings))
+    if own := sorted({item.card.task for item in plan if pages({"env": item.card.task})}):
+        units = {kind: {"unit": offered(kind).unit} for kind in own}
+        with whole(out / f"{study.name}{TASKS}", durable=True) as part:
+            part.write_text(json.dumps(units, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     return sum(1 for _, run in there if run is None or run.status != "finished")
 
 

@@ -17,11 +17,11 @@ from reports.data.schema import MADE, METRICS, RUNS
 from rhmc.envs import EnvConfig
 from rhmc.envs.coverage import Config as Coverage
 from rhmc.envs.navigation import Config as Navigation
+from rhmc.yardsticks import offered
 from rhmc.yardsticks.scores import SLOW, names, play_yardsticks
 
 STUDY = "yardsticks"
 QUESTION = "What do policies without learning, and bounds, reach?"
-SEM_OF = {"coverage": "coverage", "navigation": "return"}  # whose standard error a task's `sem` is
 
 # What the report uses: the studies' tasks, and coverage with other numbers, one changed at a time.
 TASKS: tuple[EnvConfig, ...] = (
@@ -184,7 +184,7 @@ def _run(evaluation: Evaluation, name: str, code: str, profile: str) -> Row:
 def _values(run: Row, score: Mapping[str, float]) -> Iterable[Row]:
     place = {key: run[key] for key in ("study", "arm", "seed", "run")} | {"step": 0}
     for key, value in score.items():
-        name = f"{SEM_OF[run['task']]}_sem" if key == "sem" else key
+        name = f"{offered(run['task']).score}_sem" if key == "sem" else key
         yield place | {"metric": f"final/{name}", "value": value}
 
 

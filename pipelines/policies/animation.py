@@ -3,7 +3,7 @@
 A picture is drawn at twice its size and made smaller, which smooths its edges.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from io import BytesIO
 from typing import Any, NamedTuple
 
@@ -11,7 +11,9 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
+from pipelines.workspace.errors import InputError
 from rhmc.envs import EnvConfig, coverage, navigation
+from rhmc.yardsticks import offered
 
 SIDE = 280  # pixels of a panel
 LINES = 34  # pixels of the text below it
@@ -45,12 +47,16 @@ def gif(env: EnvConfig, panels: Sequence[Panel], frames: int, milliseconds: int)
         env: the task of all panels, whose episodes are equally long.
         frames: at most so many; the steps between are left out, the last one never.
         milliseconds: of each frame.
+
+    Raises:
+        InputError: the task offers no painter.
     """
+    paint, half_width = painter(env.kind)
     steps = len(panels[0].scenes)
     stride = max(1, -(-(steps - 1) // max(1, frames - 1)))
     shown = sorted({*range(0, steps, stride), steps - 1})
-    half = [_half_width(env, panel) for panel in panels]
-    pictures = [_picture(env, panels, max(half), step) for step in shown]
+    half = max(map(half_width, panels))
+    pictures = [_picture(paint, panels, half, step) for step in shown]
     palette = _palette()
     flat = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
     out = BytesIO()
@@ -69,14 +75,12 @@ def _palette() -> Image.Image:
     return image
 
 
-def _half_width(env: EnvConfig, panel: Panel) -> float:
-    if env.kind == "coverage":
-        return COVERAGE_VIEW
+def _navigation_view(panel: Panel) -> float:
     furthest = max(float(scene.state.position.abs().max()) for scene in panel.scenes)
     return min(max(NAVIGATION_VIEW[0], 1.1 * furthest), NAVIGATION_VIEW[1])
 
 
-def _picture(env: EnvConfig, panels: Sequence[Panel], half: float, step: int) -> Image.Image:
+def _picture(paint: "Paint", panels: Sequence[Panel], half: float, step: int) -> Image.Image:
     sheet = Image.new("RGB", (SIDE * len(panels), SIDE + LINES), "white")
     write = ImageDraw.Draw(sheet)
     font = ImageFont.load_default(12)
@@ -84,7 +88,7 @@ def _picture(env: EnvConfig, panels: Sequence[Panel], half: float, step: int) ->
         scene, left = panel.scenes[step], place * SIDE
         large = Image.new("RGB", (FINE * SIDE, FINE * SIDE), "white")
         brush = Brush(ImageDraw.Draw(large, "RGBA"), half)
-        PAINTERS[env.kind](brush, scene)
+        paint(brush, scene)
         sheet.paste(large.resize((SIDE, SIDE), Image.Resampling.BOX), (left, 0))
         write.text((left + 6, SIDE + 2), panel.title, fill=INK, font=font)
         write.text((left + 6, SIDE + 17), scene.text, fill=INK, font=font)
@@ -177,4 +181,31 @@ def _team(i: int) -> tuple[int, int, int]:
     return TEAM[i % len(TEAM)]
 
 
-PAINTERS = {"coverage": paint_coverage, "navigation": paint_navigation}
+Paint = Callable[["Brush", Scene], None]
+
+
+class Painter(NamedTuple):
+    """How a task is drawn."""
+
+    paint: Paint
+    half_width: Callable[[Panel], float]  # of what a panel shows
+
+
+PAINTERS = {  # of this project's tasks
+    "coverage": Painter(paint_coverage, lambda panel: COVERAGE_VIEW),
+    "navigation": Painter(paint_navigation, _navigation_view),
+}
+
+
+def painter(kind: str) -> Painter:
+    """How a task is drawn, as this project or the task itself has it.
+
+    Raises:
+        InputError: neither has.
+    """
+    offers = offered(kind)
+    if kind in PAINTERS:
+        return PAINTERS[kind]
+    if offers.painter is None:
+        raise InputError(f"the task '{kind}' offers no painter, so its episodes are not drawn")
+    return Painter(offers.painter, lambda panel: offers.half_width)

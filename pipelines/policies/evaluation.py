@@ -78,7 +78,7 @@ def task(env: EnvConfig, episodes: EvaluationEpisodes) -> EnvConfig:
         return env
     fields = {name: _option(value, name) for name, value in (env.model_dump(mode="json") | wanted).items()}
     if "targets" in wanted and "targets" not in type(env).model_fields:
-        raise InputError("--targets: in navigation there are as many landmarks as agents; give --agents")
+        raise InputError(f"--targets: in {env.kind} their number is not a setting of its own; give --agents")
     found, faults = validate(ENVS[env.kind].config, _option(fields, env.kind))
     if found is None:
         raise InputError(*map(str, faults))

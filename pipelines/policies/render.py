@@ -10,13 +10,12 @@ from torch import Generator, Tensor
 
 from pipelines.policies.animation import Panel, Scene, gif
 from pipelines.specs.document import choices
-from pipelines.specs.safe_names import MEASURES
 from pipelines.tracking import policy
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.leftovers import scratch
 from pipelines.workspace.work_folder import Home, StoreError, whole
 from rhmc.envs import ENVS, EnvConfig, coverage
-from rhmc.yardsticks import POLICIES
+from rhmc.yardsticks import POLICIES, offered
 from rhmc.yardsticks.coverage import windows
 from rhmc.yardsticks.joint import best_choice
 
@@ -44,10 +43,11 @@ def yardstick(env: EnvConfig, name: str, episode: int) -> Act:
     Raises:
         InputError: the task has no such policy.
     """
-    table = POLICIES[env.kind]
+    table = POLICIES.get(env.kind, {})
     if name not in table:
-        known = [*table, FREE] if env.kind == "coverage" else [*table]
-        raise InputError(f"--beside: '{name}' is not allowed; {choices(name, known)}")
+        known = [*table, *PLACED.get(env.kind, {})]
+        allowed = choices(name, known) if known else f"the task '{env.kind}' offers no policy without learning"
+        raise InputError(f"--beside: '{name}' is not allowed; {allowed}")
     own = Generator().manual_seed(episode)
     return lambda state: (table[name](env, state, own), None)
 
@@ -58,8 +58,8 @@ def panel(env: EnvConfig, name: str, episode: int) -> list[Scene]:
     Raises:
         InputError: the task has neither.
     """
-    if name == FREE and env.kind == "coverage":
-        return play(env, yardstick(env, "hold", episode), episode, freely)
+    if place := PLACED.get(env.kind, {}).get(name):
+        return play(env, yardstick(env, "hold", episode), episode, place)
     return play(env, yardstick(env, name, episode), episode)
 
 
@@ -70,6 +70,9 @@ def freely(state: coverage.State) -> coverage.State:
     window = best_choice(seen, torch.zeros_like(turn))
     turned = state.heading + turn.gather(-1, window.unsqueeze(-1)).squeeze(-1)
     return state._replace(heading=coverage.wrap(turned))
+
+
+PLACED: dict[str, dict[str, Callable[[Any], Any]]] = {"coverage": {FREE: freely}}  # bounds that can be shown
 
 
 @torch.no_grad()
@@ -91,13 +94,11 @@ def play(env: EnvConfig, act: Act, episode: int, place: Callable[[Any], Any] | N
         infos.append(out.info)
         so_far = {key: torch.stack([info[key] for info in infos]) for key in infos[0]}
         score = physics.summary(env, torch.stack(rewards), so_far)
-        text = f"step {step}: " + ", ".join(_words(name, float(value)) for name, value in _told(score).items())
+        text = f"step {step}: " + ", ".join(
+            _words(name, float(score[name])) for name in offered(env.kind).measures if name in score
+        )
         scenes.append(Scene(state, None if assignment is None else assignment[0], text))
     return scenes
-
-
-def _told(score: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {name: score[name] for name in MEASURES if name in score}
 
 
 def _words(name: str, value: float) -> str:
@@ -105,7 +106,9 @@ def _words(name: str, value: float) -> str:
         return f"{100 * value:.0f} % covered"
     if name == "coverage":
         return f"coverage so far {value:.1f} %"
-    return f"{value:.0f} bumps" if name == "collisions" else f"return {value:.1f}"
+    if name == "collisions":
+        return f"{value:.0f} bumps"
+    return f"return {value:.1f}" if name == "return" else f"{name.replace('_', ' ')} {value:.2f}"
 
 
 def episode_gif(saved: policy.Saved, episode: int = 0, beside: str | None = None, frames: int = FRAMES) -> bytes:

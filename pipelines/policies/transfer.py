@@ -3,15 +3,14 @@
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from pipelines.export.tables import write_parquet
 from pipelines.policies.evaluation import EvaluationEpisodes, Policy, score
+from pipelines.tracking.policy import acting
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.process_pool import side_by_side
-from pipelines.workspace.work_folder import without_replay
 from reports.data.schema import TRANSFER
-from rhmc.envs import coverage
 
 FILE = "transfer.parquet"
 
@@ -62,18 +61,20 @@ def transfer(
 
 def _light(policy: Policy) -> Policy:
     """A policy without the replay that a run under way has, which is too much to hand to another process."""
-    return policy._replace(saved=policy.saved._replace(algorithm=without_replay(policy.saved.algorithm)))
+    saved = policy.saved
+    return policy._replace(saved=saved._replace(algorithm=acting(saved.spec.algo.kind, saved.algorithm)))
 
 
 def _play(policy: Policy, study: str, agents: Sequence[int], targets: Sequence[int], episodes: int) -> list[Row]:
     """The rows of one policy."""
-    env = policy.saved.spec.env
-    if not isinstance(env, coverage.Config):
-        raise InputError(f"{policy.arm}: transfer is of coverage, where agents and targets have numbers of their own")
+    env: Any = policy.saved.spec.env
+    if "targets" not in type(env).model_fields:
+        raise InputError(f"{policy.arm}: transfer is of tasks where agents and targets have numbers, not of {env.kind}")
+    task = " ".join([env.kind, *([env.preset] if "preset" in type(env).model_fields else [])])
     rows: list[Row] = []
     for size in sizes(policy, agents, targets):
         found = score(policy, EvaluationEpisodes(episodes=episodes, agents=size.agents, targets=size.targets))
-        place = (study, policy.arm, policy.saved.spec.seed, policy.saved.spec.id, f"{env.kind} {env.preset}")
+        place = (study, policy.arm, policy.saved.spec.seed, policy.saved.spec.id, task)
         values = (found.values["return"], found.values["return_sem"])
         rows.append((*place, *size, env.agents, env.targets, episodes, *values))
     return rows

@@ -1,7 +1,8 @@
 """A name for the code that decides a run: it changes when that run's behaviour may change, and with nothing else.
 
 The code of a run is what its method's page, its task's page and the trainer import, directly or not, as
-`pipelines.specs.syntax` reads it. A page is used by nobody but its own runs, since it registers itself.
+`pipelines.specs.syntax` reads it. A page is used by nobody but its own runs, since it registers itself. Where a page is
+of a package outside this project, all modules of that package count: nothing says how they find each other.
 """
 
 import importlib.util
@@ -11,6 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from pipelines.specs.syntax import Code, digest
+from pipelines.workspace.own_packages import top_of
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import ENVS
 
@@ -18,26 +20,26 @@ PACKAGE, TRAINER = "rhmc", "rhmc.training.trainer"
 LIBRARY = "torch"  # decides results beside the code
 
 
-def code_id(method: str, task: str, plugins: Iterable[str] = ()) -> str:
+def code_id(method: str, task: str) -> str:
     """12 hex digits over all code that decides the runs of a method in a task.
 
     Args:
         method: its kind.
         task: its kind.
-        plugins: packages that a study names; all of each counts.
 
     Raises:
         SyntaxError: a module does not parse.
         ModuleNotFoundError: there is no such package.
     """
-    return combined(modules(method, task, plugins).values())
+    return combined(modules(method, task).values())
 
 
-def modules(method: str, task: str, plugins: Iterable[str] = ()) -> Mapping[str, str]:
+def modules(method: str, task: str) -> Mapping[str, str]:
     """The digest of each module in the code of a method's runs in a task, by dotted name."""
     pages = [ALGORITHMS[method].config.__module__, ENVS[task].config.__module__]
-    code = _code(frozenset({PACKAGE, *map(_top, pages), *plugins}))
-    return code.closure([TRAINER, *pages, *(name for name in code.sources if _top(name) in set(plugins))])
+    others = {top_of(page) for page in pages} - {PACKAGE}
+    code = _code(frozenset({PACKAGE, *others}))
+    return code.closure([TRAINER, *pages, *(name for name in code.sources if top_of(name) in others)])
 
 
 def present() -> frozenset[str]:
@@ -55,10 +57,6 @@ def fingerprint() -> str:
 def _code(packages: frozenset[str]) -> Code:
     """As it was when this process first asked: an edit while a study runs concerns the next launch."""
     return Code({name: folder_of(name) for name in packages})
-
-
-def _top(module: str) -> str:
-    return module.partition(".")[0]
 
 
 def combined(digests: Iterable[str]) -> str:

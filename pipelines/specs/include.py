@@ -13,7 +13,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from pipelines.specs.document import Fault, Node, merge, nearest, read, show
+from pipelines.specs.document import Fault, Node, choices, merge, nearest, read, show
+from pipelines.workspace.errors import InputError
 from pipelines.workspace.files import ABSENT, fault_of
 
 KEY, SUFFIX = "include", ".yaml"
@@ -151,3 +152,33 @@ def _offered(way: _Way, name: str) -> list[str]:
 
 def _empty(link: Node, path: Path, section: str) -> Fault:
     return Fault(link.place, link.path, f"{path}: empty; a file to be included has a mapping '{section}'")
+
+
+# Studies that this package brings along
+
+
+def shipped() -> list[str]:
+    """The files that can be copied."""
+    return sorted(path.stem for path in SHIPPED.glob("*.yaml"))
+
+
+def copy(name: str, out: Path) -> list[Path]:
+    """Write a study and the files that it includes into a folder, and return where they are.
+
+    Raises:
+        InputError: there is no such study, or another file has the place; nothing is written.
+        StoreError: the folder cannot be written to.
+    """
+    from pipelines.workspace.work_folder import whole  # which brings torch along
+
+    if name not in shipped():
+        raise InputError(f"'{name}' is no study of this package; {choices(name, shipped())}")
+    wanted = {out / path.relative_to(SHIPPED): path.read_bytes() for path in closure(SHIPPED / f"{name}.yaml")}
+    for path, text in wanted.items():
+        if path.exists() and (not path.is_file() or path.read_bytes() != text):
+            raise InputError(f"{path}: something else is there; move it away, or name another folder with --out")
+    for path, text in wanted.items():
+        if not path.exists():
+            with whole(path) as part:
+                part.write_bytes(text)
+    return list(wanted)

@@ -20,7 +20,7 @@ class Start(NamedTuple):
 
 
 def starts(setting: Setting) -> list[Start]:
-    """Of every part of the method that learns."""
+    """Of every part of the method that learns; nothing of a method outside this project that has neither rule."""
     algo, copies = setting.algo, setting.trainer.num_envs
     if isinstance(algo, hitmac.Config):
         return _hitmac(algo, copies, _episode(setting))
@@ -28,7 +28,8 @@ def starts(setting: Setting) -> list[Start]:
         return _rhmc(algo, copies, _episode(setting))
     if isinstance(algo, OffPolicy):
         return [_warm(algo, copies)]
-    assert isinstance(algo, OnPolicy)
+    if not isinstance(algo, OnPolicy):
+        return []
     return [Start(algo.n_steps * copies, f"n_steps {algo.n_steps:,} x num_envs {copies:,}")]
 
 

@@ -30,8 +30,7 @@ READABLE = 60  # characters of a slug before its digest
 _OTHER = re.compile(r"[^A-Za-z0-9._+-]+")
 _DIGEST = re.compile(r"-[0-9a-f]{8}\Z", re.IGNORECASE)
 
-MEASURES = ("return", "coverage", "landmarks_covered", "collisions")  # of an evaluation, as far as the task has them
-FINALS = {f"final/{name}": name.replace("_", " ") for name in MEASURES}  # in words
+MEASURES = ("return", "coverage", "landmarks_covered", "collisions")  # of evaluations, with a short name in MLflow
 HEADLINES = {name: f"eval/{name}" for name in MEASURES} | {"steps_per_second": "time/steps_per_second"}
 SHOWN = {full: short for short, full in HEADLINES.items()}
 

@@ -31,9 +31,9 @@ from pipelines.specs.document import Fault, Node, Place, choices, join, merge, s
 from pipelines.specs.grid import nested
 from pipelines.specs.identity import code_id
 from pipelines.specs.include import closure
+from pipelines.specs.plugins import configs
 from pipelines.specs.safe_names import study_name
 from pipelines.specs.study import (
-    TABLES,
     TWIN,
     Base,
     Counts,
@@ -142,6 +142,7 @@ class File(Frozen):
     pruner: Pruner = Pruner()
     profiles: Profiles = Profiles()
     resources: Resources = Resources()
+    imports: list[str] = Field(default_factory=list)
 
 
 class Arm(NamedTuple):
@@ -295,7 +296,7 @@ def _tried(setting: Setting, values: dict[str, Node]) -> list[Fault]:
     place = next(iter(values.values())).place
     layers = [nested(key.split("."), value) for key, value in values.items()]
     whole = reduce(merge, layers, _written("", setting.algo.model_dump(mode="json"), place))
-    return validate(TABLES["algo"][setting.algo.kind], whole)[1]
+    return validate(configs("algo")[setting.algo.kind], whole)[1]
 
 
 def _written(key: str, value: Any, place: Place) -> Node:

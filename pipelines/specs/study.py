@@ -17,9 +17,9 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any, Generic, Literal, NamedTuple, Self, TypeVar
 
-from pydantic import BaseModel, Field, SerializeAsAny, ValidationInfo, field_validator
+from pydantic import BaseModel, Field, SerializeAsAny, ValidationInfo, field_validator, model_validator
 
-from pipelines.specs import limits
+from pipelines.specs import limits, plugins
 from pipelines.specs.document import (
     Fault,
     Node,
@@ -36,30 +36,22 @@ from pipelines.specs.document import (
 )
 from pipelines.specs.grid import MOST, Point, nested, points, replaced
 from pipelines.specs.include import included
+from pipelines.specs.plugins import configs
 from pipelines.specs.readings import NOTHING, Cell, Plan, ProfileReadings, Reading, Readings, Spelled, spelled
 from pipelines.specs.safe_names import ARM, PROFILES, alike, fault_of_study, simple, study_name, too_long
 from pipelines.workspace.errors import InputError, seen
-from rhmc.algorithms import ALGORITHMS
-from rhmc.envs import ENVS, EnvConfig
+from rhmc.envs import EnvConfig
 from rhmc.training import trainer
 from rhmc.types import Frozen
 
 SECTIONS = ("env", "algo", "trainer")
+IMPORTS = "imports"  # of a study, what it names; of a setting, what it needs
 SPACE = "space"  # of a search's arm; it may include as sections do
 COUNTS = ("seeds", "steps")  # fields of a study that hold a number for each profile
-TABLES: dict[str, dict[str, type[Any]]] = {  # the configuration of every kind
-    "env": {kind: task.config for kind, task in ENVS.items()},
-    "algo": {kind: method.config for kind, method in ALGORITHMS.items()},
-}
 NAMED = 3  # arms that a fault names
 VARIANTS = 100  # of a study
 TWIN = "is the same as arm"
 M = TypeVar("M", bound=BaseModel)
-FIELDS = [  # every dotted name of a run's settings
-    f"{section}.{field}"
-    for section, configs in (TABLES | {"trainer": {"": trainer.Config}}).items()
-    for field in sorted({name for config in configs.values() for name in settings(config)})
-]
 COMMON = {"env": "observation", "algo": "encoder"}  # what must not differ between methods by oversight
 
 
@@ -71,12 +63,40 @@ class StudyError(InputError):
         super().__init__(*map(str, self.faults))
 
 
+def fields() -> list[str]:
+    """Every dotted name of a run's settings, of all kinds that are registered now."""
+    tables: dict[str, dict[str, Any]]
+    tables = {"env": configs("env"), "algo": configs("algo"), "trainer": {"": trainer.Config}}
+    return [
+        f"{section}.{field}"
+        for section, table in tables.items()
+        for field in sorted({name for config in table.values() for name in settings(config)})
+    ]
+
+
 class Setting(Frozen):
-    """A run but for its seed."""
+    """A run but for its seed.
+
+    Raises:
+        UnnamedError: it is of a package that nobody has named here, see `pipelines.specs.plugins`.
+    """
 
     env: SerializeAsAny[EnvConfig]
     algo: Any
     trainer: trainer.Config
+    # What defines method and task outside this project; follows from their kinds, and names nothing.
+    imports: tuple[str, ...] = Field((), exclude_if=lambda modules: not modules)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_imports(cls, data: Any) -> Any:
+        """See that the modules are there, also where the record is from elsewhere, and write down which they are."""
+        if not isinstance(data, dict):
+            return data
+        parts = {name: data.get(name) for name in ("env", "algo")}
+        kinds = {k: v.get("kind") if isinstance(v, dict) else getattr(v, "kind", None) for k, v in parts.items()}
+        plugins.require(kinds, data.get(IMPORTS))
+        return data | {IMPORTS: plugins.pages(kinds)}
 
     @field_validator("env", "algo", mode="before")
     @classmethod
@@ -84,9 +104,10 @@ class Setting(Frozen):
         """A plain mapping becomes the configuration that its kind names."""
         if not isinstance(value, dict):
             return value
-        table, kind = TABLES[str(field.field_name)], value.get("kind")
+        section, kind = str(field.field_name), value.get("kind")
+        table = configs(section)
         if not isinstance(kind, str) or kind not in table:
-            raise ValueError(f"kind: {show(kind)} is not allowed; {choices(kind, table)}")
+            raise ValueError(f"kind: {plugins.unknown(section, kind)}")
         return table[kind].model_validate(value)
 
     def canonical(self) -> str:
@@ -270,6 +291,7 @@ class File(Frozen):
     steps: Counts
     profiles: Profiles = Profiles()
     resources: Resources = Resources()
+    imports: list[str] = Field(default_factory=list)
 
 
 class GridFile(File):
@@ -332,10 +354,14 @@ def load_layers(
         variant: one of its `variants`; None for the arms as they stand.
 
     Raises:
-        StudyError: there is no mapping to go on with.
+        StudyError: there is no mapping to go on with, or a module that it imports cannot be used.
+        InputError: `plugins.VARIABLE` names such a module.
     """
     root, patches, faults = _trees(path, model, profile, overrides)
     root = _normal(reduce(merge, patches, root), counts)
+    if found := plugins.imported(root.children.get(IMPORTS), path.parent):
+        raise StudyError([*faults, *found])
+    plugins.discover()
     file, structure = validate(gridded if gridded and "grid" in root.children else model, root)
     known = root._replace(value={key: child for key, child in root.children.items() if key in model.model_fields})
     variants = _group(known, "variants")
@@ -502,9 +528,9 @@ def _planned(
     """Every arm of a profile at every point of its grid, or under every reading, by name."""
     arms, faults = _changed(_group(root, "arms"), profile, patches)
     grid, found = replaced(_child(root, "grid"), _child(profile, "grid"))
-    combined, more = points(grid, FIELDS, len(arms))
+    combined, more = points(grid, fields(), len(arms))
     block = _child(root, "readings")
-    read = _exclusive(block, grid) or spelled(block, _child(profile, "readings"), FIELDS, len(arms))
+    read = _exclusive(block, grid) or spelled(block, _child(profile, "readings"), fields(), len(arms))
     crossed = _under(arms, read.readings) if read.readings else _crossed(arms, combined)
     more += _alike_faults("arm", {name: arm.layer for name, arm in crossed.items()})
     more += [_long_name(name, arm.layer) for name, arm in crossed.items() if len(name) > ARM]
@@ -603,13 +629,13 @@ def _section(layers: Sequence[Node], name: str) -> Node | None:
 
 
 def _of_kind(section: str, node: Node) -> tuple[BaseModel | None, list[Fault]]:
-    table, kind = TABLES[section], node.children.get("kind")
+    table, kind = configs(section), node.children.get("kind")
     if kind is None and node.path.startswith("base."):
         return None, [Fault(node.key, join(node.path, "kind"), f"missing; allowed: {', '.join(table)}")]
     if kind is None or isinstance(kind.value, Unreadable):
         return None, []  # said of the base, or of the value
     if not isinstance(kind.value, str) or kind.value not in table:
-        return None, [Fault(kind.place, kind.path, f"{show(kind.value)} is not allowed; {choices(kind.value, table)}")]
+        return None, [Fault(kind.place, kind.path, plugins.unknown(section, kind.value))]
     return validate(table[kind.value], node)
 
 
@@ -732,7 +758,7 @@ def _unstated(base: Node | None, arm: Node) -> list[Fault]:
         common, kind, other = _child(before, field), _child(before, "kind"), _child(after, "kind")
         if not (common and kind and after and other) or kind.value == other.value or field in after.children:
             continue
-        config = TABLES[section].get(str(other.value))
+        config = configs(section).get(str(other.value))
         if config and field in config.model_fields:
             text = f"missing; another kind inherits nothing, and the base has {show(common.value)}: state it here"
             faults.append(Fault(after.place, join(after.path, field), text))

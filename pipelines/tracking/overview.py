@@ -11,7 +11,7 @@ from io import BytesIO, StringIO
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from pipelines.specs.safe_names import FINALS
+from pipelines.specs.plugins import finals
 from pipelines.tracking import arm_colours
 from pipelines.tracking.plan import LISTED, Item, more
 from pipelines.tracking.tracker import Recorded, Row, Status, StudyCard, Tracker
@@ -64,7 +64,7 @@ class Overview:
         self.runs = {(item.card.arm, item.key): Run(item.card.arm, item.card.seed, None, (), {}) for item in plan}
         there = {run.ref: run for run in recorded if (run.arm, run.key) in self.runs}
         rows: dict[str, list[Row]] = {ref: [] for ref in there}
-        for row in tracker.rows(list(there), {CURVE, *FINALS}) if there else []:
+        for row in tracker.rows(list(there), {CURVE, *finals()}) if there else []:
             rows[row.ref].append(row)
         for ref, run in there.items():
             self._take(run.arm, run.key, run.status, [(row.step, {row.metric: row.value}) for row in rows[ref]])
@@ -82,12 +82,12 @@ class Overview:
 
     def _take(self, arm: str, key: str, status: Status, points: Iterable[tuple[int, Mapping[str, float]]]) -> None:
         run = self.runs[arm, key]
-        curve, finals = dict(run.curve), dict(run.finals)
+        curve, ends = dict(run.curve), dict(run.finals)
         for step, values in points:
             if CURVE in values:
                 curve.setdefault(step, values[CURVE])
-            finals |= {name: values[name] for name in FINALS if name in values}
-        self.runs[arm, key] = run._replace(status=status, curve=sorted(curve.items()), finals=finals)
+            ends |= {name: values[name] for name in finals() if name in values}
+        self.runs[arm, key] = run._replace(status=status, curve=sorted(curve.items()), finals=ends)
 
     def describe(self) -> None:
         """Refresh the description alone."""
@@ -130,7 +130,7 @@ def by_arm(runs: Iterable[Run]) -> dict[str, list[Run]]:
 
 def so_far(runs: Sequence[Run]) -> str:
     """Markdown: which seeds are finished, the mean of each final metric over them, and who is ahead."""
-    shown = {key: name for key, name in FINALS.items() if any(key in run.finals for run in runs)}
+    shown = {key: name for key, name in finals().items() if any(key in run.finals for run in runs)}
     heads = ["arm", "finished seeds", "others", *(f"final {name}" for name in shown.values())]
     lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     arms = by_arm(runs)
@@ -177,7 +177,7 @@ def table(runs: Sequence[Run]) -> str:
     """CSV: every planned run with its final values."""
     out = StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    shown = [key for key in FINALS if any(key in run.finals for run in runs)]
+    shown = [key for key in finals() if any(key in run.finals for run in runs)]
     writer.writerow(["arm", "seed", "status", *shown])
     for run in runs:
         writer.writerow([cell(run.arm), run.seed, run.status or "missing", *(run.finals.get(key, "") for key in shown)])

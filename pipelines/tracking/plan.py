@@ -15,7 +15,7 @@ from pipelines.specs.document import choices
 from pipelines.specs.identity import combined, modules
 from pipelines.specs.safe_names import folded
 from pipelines.specs.search import Search
-from pipelines.specs.study import RunSpec, Study, changes
+from pipelines.specs.study import IMPORTS, RunSpec, Study, changes
 from pipelines.tracking.tracker import Card, Recorded, StudyCard
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.provenance import Host
@@ -51,7 +51,7 @@ def items(study: Study, commit: str = "", where: Host | None = None) -> list[Ite
     varying = what_varies([run.spec for run in runs])
     planned = []
     for run in runs:
-        spec, flat = run.spec, flatten(run.spec.model_dump(mode="json"))
+        spec, flat = run.spec, flat_settings(run.spec)
         algorithm, task = spec.algo.kind, spec.env.kind
         params = {"method": algorithm} | {name: str(flat[name]) for name in varying if name in flat and name != KIND}
         params |= {"seed": str(spec.seed)}
@@ -107,9 +107,14 @@ def flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
+def flat_settings(spec: RunSpec) -> dict[str, Any]:
+    """The settings of a run by dotted name; what it imports follows from them."""
+    return flatten(spec.model_dump(mode="json", exclude={IMPORTS}))
+
+
 def what_varies(specs: Iterable[RunSpec]) -> list[str]:
     """The dotted names whose value is not the same in all specs that have them."""
-    flats = [flatten(spec.model_dump(mode="json")) for spec in specs]
+    flats = [flat_settings(spec) for spec in specs]
     names = {name: None for flat in flats for name in flat}
     return [name for name in names if len({json.dumps(flat[name]) for flat in flats if name in flat}) > 1]
 
@@ -132,7 +137,7 @@ def study_card(study: Study) -> StudyCard:
 def _varying(specs: Sequence[RunSpec]) -> dict[str, list[str]]:
     """The settings that vary between runs, as far as the runs of each method have it."""
     names = [name for name in what_varies(specs) if name != KIND]
-    flats = {spec.algo.kind: flatten(spec.model_dump(mode="json")) for spec in specs}
+    flats = {spec.algo.kind: flat_settings(spec) for spec in specs}
     return {method: [name for name in names if name in flat] for method, flat in flats.items()}
 
 

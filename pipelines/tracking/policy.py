@@ -10,11 +10,13 @@ from pydantic import ValidationError
 from ruamel.yaml import YAML, YAMLError
 from torch import Generator, Tensor
 
-from pipelines.specs.study import RunSpec
+from pipelines.specs.plugins import UnnamedError
+from pipelines.specs.study import IMPORTS, RunSpec
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.files import regular
 from pipelines.workspace.work_folder import DamagedError, load_whole, one_line, save_atomically, without_replay
 from rhmc.algorithms import ALGORITHMS
+from rhmc.algorithms.acting import ACTS_ON
 from rhmc.envs import ENVS, EnvConfig
 from rhmc.types import Batch, Carry, Obs, Spec, State
 
@@ -110,7 +112,13 @@ def save(path: Path, saved: Saved) -> None:
     Raises:
         StoreError: the file cannot be written.
     """
-    save_atomically(path, {SPEC: saved.spec.canonical(), "algorithm": without_replay(saved.algorithm)})
+    save_atomically(path, {SPEC: saved.spec.canonical(), "algorithm": acting(saved.spec.algo.kind, saved.algorithm)})
+
+
+def acting(method: str, state: State) -> State:
+    """The part of a method's state that acting needs, as the method says; it may lack what learning keeps."""
+    says = ACTS_ON.get(method)
+    return says(state) if says else without_replay(state)
 
 
 def settings(config: Path) -> tuple[RunSpec, str]:
@@ -125,6 +133,8 @@ def settings(config: Path) -> tuple[RunSpec, str]:
         return _spec(tree), str(tree.get("arm", "policy"))
     except FileNotFoundError as error:
         raise InputError(f"{config}: no such file; --config names the config.yaml that the run keeps") from error
+    except UnnamedError as error:
+        raise InputError(f"{config}: {error}") from error
     except (OSError, YAMLError, *NO_SPEC) as error:
         raise InputError(f"{config}: not the config.yaml of a run ({one_line(error)})") from error
 
@@ -133,9 +143,9 @@ NO_SPEC = (ValidationError, ValueError, KeyError, TypeError, AttributeError)  # 
 
 
 def _spec(fields: Any) -> RunSpec:
-    if missing := [name for name in RunSpec.model_fields if name not in fields]:
+    if missing := [name for name in RunSpec.model_fields if name not in fields and name != IMPORTS]:
         raise ValueError(f"{missing[0]}: missing")
-    return RunSpec.model_validate({name: fields[name] for name in RunSpec.model_fields})
+    return RunSpec.model_validate({name: fields[name] for name in RunSpec.model_fields if name in fields})
 
 
 def _files(path: Path) -> list[Path]:
@@ -170,6 +180,8 @@ def _told(file: Path, written: str | None) -> RunSpec:
         return settings(config)[0]
     try:
         return _spec(json.loads(written))
+    except UnnamedError as error:
+        raise InputError(f"{file}: {error}") from error
     except NO_SPEC as error:
         raise InputError(f"{file}: not the settings of a run that this code knows ({one_line(error)})") from error
 

@@ -11,7 +11,8 @@ import zlib
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from pipelines.specs.safe_names import FINALS, HEADLINES
+from pipelines.specs.plugins import finals
+from pipelines.specs.safe_names import HEADLINES
 from pipelines.tracking import arm_colours
 
 TAG = "mlflow.sharedViewState."
@@ -122,9 +123,9 @@ def _column(kind: str, name: str) -> str:
 
 def _columns(names: Sequence[str]) -> list[str]:
     """Final values, what varies, the speed; the models last."""
-    finals = [_column("metrics", name) for name in FINALS]
+    ends = [_column("metrics", name) for name in finals()]
     varying = [_column("params", name) for name in ("method", *names) if name != "seed"]  # which a run's name says
-    return [*finals, *varying, _column("metrics", "steps_per_second"), MODELS]
+    return [*ends, *varying, _column("metrics", "steps_per_second"), MODELS]
 
 
 def _width(*texts: str) -> int:
@@ -135,7 +136,7 @@ def _width(*texts: str) -> int:
 def _curves() -> State:
     as_measured = {"lineSmoothness": 0, "useGlobalLineSmoothing": False, "displayPoints": False}
     lines = [_chart("LINE", CURVES, name) | as_measured for name in HEADLINES]
-    bars = [_chart("BAR", ENDS, name) for name in FINALS]
+    bars = [_chart("BAR", ENDS, name) for name in finals()]
     shown = [_section(name, columns=2, cardHeight=LINE_HEIGHT) for name in (CURVES, ENDS)]
     return {"compareRunSections": [*shown, *_folded()], "compareRunCharts": lines + bars}
 

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 
 from pipelines.specs.study import RunSpec
-from pipelines.tracking.plan import Item, flatten
+from pipelines.tracking.plan import Item, flat_settings
 from pipelines.tracking.policy import CONFIG, settings
 from pipelines.tracking.tracker import Recorded, Tracker
 from pipelines.workspace.errors import InputError
@@ -60,8 +60,8 @@ def _code(run: Recorded, item: Item, copied: Copied) -> str:
 
 def _settings(before: RunSpec, now: RunSpec) -> str:
     """The settings that differ now; nothing where only the seed is."""
-    old, new = (flatten(spec.model_dump(mode="json", exclude={"seed"})) for spec in (before, now))
-    names = [name for name in sorted({*old, *new}) if old.get(name) != new.get(name)]
+    old, new = flat_settings(before), flat_settings(now)
+    names = [name for name in sorted({*old, *new} - {"seed"}) if old.get(name) != new.get(name)]
     said = [f"{name} was {old.get(name)}, now {new.get(name)}" for name in names]
     return f"other settings: {_some(said)}" if said else ""
 

@@ -31,6 +31,7 @@ from pipelines.workspace.addresses import without_password
 from pipelines.workspace.best_effort import decoration
 from pipelines.workspace.errors import InputError, visible
 from pipelines.workspace.exit_codes import Exit
+from pipelines.workspace.own_packages import named
 from pipelines.workspace.terminal import terminal
 from pipelines.workspace.work_folder import Checkpoints, Home, StoreError
 from reports.data.escaping import markdown, prose
@@ -230,6 +231,7 @@ class Drive:
                 "folder": str(folder),
                 "checkpoint_every": self.search.resources.checkpoint_every,
                 "stop": str(self.stop.path),
+                "imports": named(),
             }
         )
 

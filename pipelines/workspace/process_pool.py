@@ -3,7 +3,7 @@
 import os
 import pickle
 import signal
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
@@ -14,6 +14,7 @@ from typing import TypeVar
 
 import torch
 
+from pipelines.workspace.own_packages import load_taken, named, take
 from pipelines.workspace.work_folder import StoreError
 
 Given = TypeVar("Given")
@@ -41,7 +42,7 @@ def side_by_side(function: Callable[[Given], Made], items: Iterable[Given], jobs
     context = get_context("spawn")  # torch's threads do not survive a fork
     theirs, ours = context.Pipe(duplex=False)
     # On the way out `ours` is closed first, which ends the workers: the pool then has nothing to wait for.
-    with theirs, ProcessPoolExecutor(jobs, context, _begin, (theirs,)) as pool, ours:
+    with theirs, ProcessPoolExecutor(jobs, context, _begin, (theirs, named())) as pool, ours:
         try:
             waiting = [_submit(pool, pickle.dumps((function, item))) for item in items]
             for future in waiting:
@@ -60,9 +61,11 @@ def _submit(pool: ProcessPoolExecutor, call: bytes) -> "Future[bytes]":
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _begin(lifeline: Connection) -> None:
-    """Make a worker ready."""
+def _begin(lifeline: Connection, imports: Mapping[str, str]) -> None:
+    """Make a worker ready. What it is given may be of packages that the user has named."""
     torch.set_num_threads(1)
+    take(imports)
+    load_taken()
     Thread(target=_end_with, args=(lifeline,), daemon=True).start()
 
 

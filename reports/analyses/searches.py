@@ -110,7 +110,7 @@ def fig_trials(results: Results, search: str) -> Drawing | None:
         axes = figure.add_axes((figures.LEFT, figures.FOOT / height, figures.SHARE, tall / height))
         for arm in reversed(curves):  # the first arm on top
             _draw(axes, curves[arm], *look(arm, arms))
-        _finish(axes, max(len(trials) for trials in tried.values()), figures.per(env.get("kind", "")))
+        _finish(axes, max(len(trials) for trials in tried.values()), figures.per(results, env.get("kind", "")))
         figures.write_labels(axes, labels, figures.LINE / tall)
         under = f"{describe_task(env)}; {spoken(results, search)}; profile: {results.profile}"
         head(figure, f"Best objective by number of trials, search {search}", under)

@@ -10,6 +10,8 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
+from reports.data.schema import TASKS
+
 METHODS, MODULES, SCENES = "methods.json", "modules.json", "scenes.json"
 METHOD = ("kind", "name", "source", "family", "training", "execution", "critic", "coordination")
 OURS = "what `rhmc drawings --out` writes"
@@ -54,6 +56,12 @@ class Method(Part):
     actions: tuple[str, ...]
     parameters: tuple[Size, ...]
     defaults: dict[str, Any] = {}  # of its settings; earlier exports lack them
+
+
+class Said(Part):
+    """What a task of another package says of itself."""
+
+    unit: Annotated[str, Field(max_length=80)]  # of its return, in words
 
 
 class Input(Part):
@@ -201,6 +209,13 @@ def read_methods(folder: Path, faults: list[str]) -> list[dict[str, Any]]:
     what = "the methods as `rhmc methods --out` writes them"
     found = _read(folder / METHODS, TypeAdapter(tuple[Method, ...]), faults, what) or ()
     return [method.model_dump() for method in found]
+
+
+def read_units(folder: Path, faults: list[str]) -> dict[str, str]:
+    """The unit of the return of each task that is not this project's, by kind."""
+    what = "what `rhmc export` writes of tasks of other packages"
+    files = [_read(file, TypeAdapter(dict[str, Said]), faults, what) or {} for file in files_in(folder, f"*{TASKS}")]
+    return {kind: said.unit for file in files for kind, said in file.items()}
 
 
 def read_modules(folder: Path, faults: list[str]) -> tuple[Build, ...]:

@@ -29,6 +29,7 @@ from reports.data.drawn import (
     read_methods,
     read_modules,
     read_scenes,
+    read_units,
 )
 from reports.data.escaping import markdown
 from reports.data.exported import (
@@ -107,6 +108,7 @@ class Results:
         notes: what was left out of the tables, in sentences.
         older: studies and searches whose tables an older version exported.
         episodes: an animation of an episode by task, as a GIF.
+        units: of the return, of each task that is not this project's.
     """
 
     points: pd.DataFrame
@@ -121,6 +123,7 @@ class Results:
     notes: tuple[str, ...] = ()
     older: tuple[str, ...] = ()
     episodes: Mapping[str, bytes] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def set_aside(self) -> str:
@@ -345,6 +348,7 @@ def load(folder: Path, profile: str, only: str | None = None) -> Results:
             faults.append(f"{name}.parquet: {name}.runs.parquet (the planned runs) is not beside it")
         if name.endswith(".runs") and name.removesuffix(".runs") not in names:
             faults.append(f"{name}.parquet: {name.removesuffix('.runs')}.parquet (the points) is not beside it")
+    units = read_units(folder, faults)
     drawn = (read_methods(folder, faults), read_modules(folder, faults), read_scenes(folder, faults))
     if not faults:
         joined = {kind: _join(found, FORMS[kind].names) for kind, found in tables.items()}
@@ -355,7 +359,7 @@ def load(folder: Path, profile: str, only: str | None = None) -> Results:
         aside = tuple(path.name.partition(".")[0] for path in files if older(path))
         methods, modules, scenes = drawn
         about: dict[str, Any] = {"methods": methods, "levels": joined[READINGS], "notes": notes, "older": aside}
-        about["trials"] = joined[TRIALS]
+        about |= {"trials": joined[TRIALS], "units": units}
         results = Results(points, runs, profile, moved=moved, **about)
         if only is None:
             results = replace(results, modules=modules, scenes=scenes, episodes=gifs)

@@ -7,6 +7,8 @@ VERSION = {
     "rhmc.tables": "2"
 }  # of the names in the tables of runs and trials; the report sets tables of an older one aside
 
+TASKS = ".tasks.json"  # after a study's name: what its tasks of other packages say of themselves
+
 PLACE = pa.schema([("study", WORDS), ("arm", WORDS), ("seed", WHOLE), ("run", WORDS)])  # run: spec id
 METRICS = pa.schema([*PLACE, ("step", WHOLE), ("metric", WORDS), ("value", NUMBER)])
 RUNS = pa.schema(  # the planned runs: nothing here depends on commit, machine or time

@@ -72,7 +72,7 @@ def learning_curves(results: Results, spec: Curves) -> Drawing | None:
         _draw_levels(axes, levels)
         for arm in reversed(list(curves)):  # the first arm on top
             _draw_curve(axes, curves[arm], *look(arm, arms))
-        _finish(axes, curves, results.env(spec.study).get("kind", ""))
+        _finish(axes, curves, per(results, results.env(spec.study).get("kind", "")))
         write_labels(axes, labels, LINE / tall)
         head(figure, spec.title, describe_task(results.env(spec.study)))
         write_legend(figure, axes, dict(zip(arms, entries, strict=True)), columns, (height - HEAD) / height)
@@ -238,18 +238,21 @@ def _name_frame(axes: Axes, arm: str, finals: NDArray[np.float64]) -> None:
     axes.tick_params(labelsize=7)
 
 
-def _finish(axes: Axes, curves: Mapping[str, pd.DataFrame], task: str) -> None:
+def _finish(axes: Axes, curves: Mapping[str, pd.DataFrame], unit: str) -> None:
     last = max(rows["step"].max() for rows in curves.values())
     axes.set_xlim(0, last or 1)
     axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: steps(x)))
     axes.yaxis.set_major_formatter(tick)
     axes.set_xlabel("environment steps")
-    axes.set_ylabel(f"return ({per(task)})")
+    axes.set_ylabel(f"return ({unit})")
 
 
-def per(task: str) -> str:
-    """What a return of a task is, in words."""
-    return "sum over an episode" if task == "navigation" else "100 × mean reward per step"
+UNITS = {"coverage": "100 × mean reward per step", "navigation": "sum over an episode"}
+
+
+def per(results: Results, task: str) -> str:
+    """What a return of a task is, in words; of one that is not this project's, what it says of itself."""
+    return UNITS.get(task) or results.units.get(task, "as the task defines it")
 
 
 def write_labels(axes: Axes, labels: Sequence[Label], line: float) -> None:

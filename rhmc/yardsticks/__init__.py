@@ -1,13 +1,14 @@
-"""Yardsticks of learned scores: policies without learning and bounds, by task and name; nothing learns here."""
+"""Yardsticks of learned scores, and what else a task offers to be shown, by task and name; nothing learns here."""
 
 from collections.abc import Callable
 from typing import Any
 
-from torch import Generator, Tensor
+from torch import Tensor
 
+from rhmc.registry import register
 from rhmc.yardsticks import coverage, navigation
+from rhmc.yardsticks.offers import OFFERS, Offers, Policy, offered
 
-Policy = Callable[[Any, Any, Generator], Tensor]  # configuration, state, generator -> actions
 Bound = Callable[[Any, Any], Tensor]  # configuration, state -> (B,) score of the present step
 
 POLICIES: dict[str, dict[str, Policy]] = {
@@ -32,3 +33,13 @@ BOUNDS: dict[str, dict[str, Bound]] = {
     "coverage": {"free_heading_bound": coverage.free_heading_bound, "range_bound": coverage.range_bound},
     "navigation": {},
 }
+
+
+def register_offers(kind: str, offers: Offers) -> None:
+    """Say what a task offers beside its physics; its page calls this once.
+
+    Raises:
+        ValueError: another entry has the kind.
+    """
+    register(OFFERS, kind, offers)
+    POLICIES[kind], BOUNDS[kind] = dict(offers.policies), {}

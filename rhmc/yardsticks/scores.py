@@ -2,21 +2,22 @@
 
 import math
 from collections.abc import Iterator, Sequence
+from functools import partial
 
 import torch
 from torch import Generator, Tensor
 
 from rhmc.envs import ENVS, EnvConfig, coverage
 from rhmc.envs.base import Outcome
-from rhmc.yardsticks import BOUNDS, POLICIES
+from rhmc.yardsticks import BOUNDS, POLICIES, offered
 
 CHUNK = 200  # episodes at once; bounds the planner's memory. Another value draws other episodes
 SLOW = ("planner",)  # left out unless asked for
 
 
 def names(kind: str) -> list[str]:
-    """All yardsticks of a task."""
-    return [*POLICIES[kind], *BOUNDS[kind]]
+    """All yardsticks of a task; none of one that offers none."""
+    return [*POLICIES.get(kind, {}), *BOUNDS.get(kind, {})]
 
 
 def play_yardsticks(
@@ -34,6 +35,7 @@ def play_yardsticks(
         For coverage, in percent: `coverage`, its standard error `sem` over episodes, `return` (mean reward per step).
         A bound has no `return` where the reward is local. For navigation: `return` (sum over an episode), its `sem`,
         `landmarks_covered` (share at the end of an episode) and `collisions` (ordered pairs, sum over an episode).
+        For another task: the means of its `summary`, and the `sem` of the measure that it offers as its score.
 
     Raises:
         ValueError: an unknown name, or fewer than two episodes.
@@ -45,7 +47,7 @@ def play_yardsticks(
         raise ValueError(f"policies: {kind} has no {', '.join(unknown)}; there are {', '.join(names(kind))}")
     if episodes < 2:
         raise ValueError(f"episodes: at least 2 are needed for a standard error, not {episodes}")
-    summary = {"coverage": _coverage, "navigation": _navigation}[kind]
+    summary = {"coverage": _coverage, "navigation": _navigation}.get(kind, partial(_summarised, env_cfg))
     return {name: summary(_episodes(env_cfg, name, episodes, seed)) for name in chosen}
 
 
@@ -67,6 +69,15 @@ def _navigation(logs: dict[str, Tensor]) -> dict[str, float]:
     }
 
 
+def _summarised(cfg: EnvConfig, logs: dict[str, Tensor]) -> dict[str, float]:
+    """The task's own summary of each episode, as training logs it."""
+    info = {name: values.T for name, values in logs.items() if name != "reward"}
+    found = ENVS[cfg.kind].physics.summary(cfg, logs["reward"].T, info)
+    return {name: values.mean().item() for name, values in found.items()} | {
+        "sem": _sem(found[offered(cfg.kind).score])
+    }
+
+
 def _sem(values: Tensor) -> float:
     return values.std().item() / math.sqrt(len(values))
 
@@ -75,7 +86,7 @@ def _episodes(cfg: EnvConfig, name: str, episodes: int, seed: int) -> dict[str, 
     """Logs of a yardstick over the episodes: (episodes, steps) each."""
     world = Generator().manual_seed(seed)
     own = Generator().manual_seed(seed)
-    run = _bound if name in BOUNDS[cfg.kind] else _policy
+    run = _bound if name in BOUNDS.get(cfg.kind, {}) else _policy
     chunks = []
     for start in range(0, episodes, CHUNK):
         steps = list(run(cfg, name, min(CHUNK, episodes - start), world, own))

@@ -13,6 +13,7 @@ from typer.main import get_command
 
 from pipelines.bundles.bundle import Packed
 from pipelines.cli import main as cli
+from pipelines.export import yardsticks  # noqa: F401  # before a test replaces what it takes from the science
 from pipelines.policies.evaluation import Score
 from pipelines.specs.search import Search
 from pipelines.specs.study import Study
@@ -130,7 +131,7 @@ CASES = [
         {"pipelines.execution.run.show_status": 0},
         ("show_status(x@large paper 3, work, as_json=True)",),
     ),
-    Case("study copy alpha --out o", {"pipelines.specs.shipped.copy": []}, ("copy(alpha, o)",)),
+    Case("study copy alpha --out o", {"pipelines.specs.include.copy": []}, ("copy(alpha, o)",)),
     Case(
         f"study export studies/x.yaml o {OTHER} --values-only",
         {"pipelines.bundles.bundle.pack": Packed(1, 1, 0)},
@@ -177,6 +178,14 @@ CASES = [
         (
             "play_yardsticks({'agents': 2, 'reward': 'mpe1', 'order': 'mpe1'}, [random], episodes=8, seed=9)",
             "export_yardsticks([scored], paper, o)",
+        ),
+    ),
+    Case(
+        f"yardsticks study studies/x.yaml {OTHER} --episodes 8 --seed 9 --out o",
+        {"pipelines.export.yardsticks.evaluate_all": [], "pipelines.export.yardsticks.export_yardsticks": ""},
+        (
+            "evaluate_all([Evaluation(env={}, policies=[random, hold, nearest, mean_all, best_window, joint_one_step, "
+            "set_point, free_heading_bound, range_bound], episodes=8, seed=9)], 1)",
         ),
     ),
     Case(

@@ -16,6 +16,7 @@ from pipelines.workspace.errors import InputError
 from pipelines.workspace.work_folder import StoreError
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import make_env
+from rhmc.learning.learner import Learner
 from rhmc.networks.nets import ENCODERS, Sizes
 
 
@@ -79,9 +80,8 @@ def test_what_is_counted_is_what_acts(monkeypatch: pytest.MonkeyPatch) -> None:
             assert kwargs == {"explore": False}
             self.asked(self.asked(torch.zeros(1, 2))[:, :2])
 
-        def state_dict(self) -> dict[str, Any]:
-            learner = {"net": self.other.state_dict(), "target_net": self.other.state_dict(), "optimiser": {}}
-            return {"two": [learner, {"net": self.asked.state_dict(), "target_net": {}, "optimiser": {}}], "rng": 1}
+        def learners(self) -> list[Learner[nn.Linear]]:
+            return [Learner(self.other, lr=0.1), Learner(self.asked, lr=0.1)]
 
     monkeypatch.setitem(ALGORITHMS, "iql", ALGORITHMS["iql"]._replace(build=Twice))
     assert count("iql", "mlp", TASKS[1]) == (9, 9 + 42)

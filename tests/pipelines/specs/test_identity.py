@@ -16,7 +16,8 @@ from pydantic.fields import FieldInfo
 from pipelines.specs import identity
 from pipelines.specs.document import settings as of_config
 from pipelines.specs.identity import TRAINER, code_id, combined, fingerprint, folder_of, modules
-from pipelines.specs.study import TABLES, RunSpec
+from pipelines.specs.plugins import configs
+from pipelines.specs.study import RunSpec
 from pipelines.specs.syntax import Code
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import ENVS
@@ -326,14 +327,23 @@ def test_a_module_in_another_folder_ages_no_run(tmp_path: Path, monkeypatch: pyt
     assert "rhmc.deep.learner" in modules("qmix", "coverage")
 
 
-def test_the_library_and_packages_of_a_study_count(toy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    before, whole = code_id("iql", "coverage"), fingerprint()
+def test_all_of_a_package_outside_the_project_counts_for_its_own_runs(
+    toy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = code_id("iql", "coverage")
     real = identity.folder_of
     monkeypatch.setattr(identity, "folder_of", lambda package: toy if package == "toy" else real(package))
-    with_toy = code_id("iql", "coverage", ["toy"])
+    page = type("Config", (), {"__module__": "toy.use"})
+    monkeypatch.setitem(ALGORITHMS, "toy", ALGORITHMS["iql"]._replace(config=page))
+    with_toy = code_id("toy", "coverage")
     edit(toy / "other.py", "SIDE = 4", "SIDE = 5")  # not imported by anything
     identity._code.cache_clear()
-    assert len({before, with_toy, code_id("iql", "coverage", ["toy"])}) == 3
+    assert len({before, with_toy, code_id("toy", "coverage")}) == 3
+    assert code_id("iql", "coverage") == before
+
+
+def test_the_library_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    before, whole = code_id("iql", "coverage"), fingerprint()
     monkeypatch.setattr(identity, "version", lambda name: "2.13.1")
     assert (code_id("iql", "coverage") == before, fingerprint() == whole) == (False, False)
     monkeypatch.setattr(identity, "version", lambda name: f"{torch.__version__.partition('+')[0]}+cu130")
@@ -355,8 +365,8 @@ def test_nothing_imports_by_a_name_that_cannot_be_read() -> None:
 # Settings
 
 CONFIGS = [
-    *(("env", kind, config) for kind, config in TABLES["env"].items()),
-    *(("algo", kind, config) for kind, config in TABLES["algo"].items()),
+    *(("env", kind, config) for kind, config in configs("env").items()),
+    *(("algo", kind, config) for kind, config in configs("algo").items()),
     ("trainer", "", TrainerConfig),
 ]
 FIELDS = [(section, kind, field) for section, kind, config in CONFIGS for field in of_config(config) if field != "kind"]

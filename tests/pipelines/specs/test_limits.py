@@ -14,8 +14,9 @@ from pipelines.execution.run import run_studies
 from pipelines.specs import limits
 from pipelines.specs.document import Node, Place, validate
 from pipelines.specs.learning_start import shortfall, starts
+from pipelines.specs.plugins import configs
 from pipelines.specs.search import Dimension, Pruner, Sampler, Search
-from pipelines.specs.study import PROFILES, TABLES, Counts, Resources, RunSpec, SeedCounts, Setting, Study, StudyError
+from pipelines.specs.study import PROFILES, Counts, Resources, RunSpec, SeedCounts, Setting, Study, StudyError
 from pipelines.workspace.errors import InputError
 from rhmc.algorithms import ALGORITHMS
 from rhmc.learning.learner import Learner
@@ -26,8 +27,8 @@ from tests.pipelines.support import setting, tiny
 
 ROOT = Path(__file__).parents[3]
 MODELS: list[type[BaseModel]] = [
-    *TABLES["env"].values(),
-    *TABLES["algo"].values(),
+    *configs("env").values(),
+    *configs("algo").values(),
     *(trainer.Config, Resources, Counts, SeedCounts, Sampler, Pruner, Dimension),
 ]
 HERE = Place("x.yaml", 1, 1)
@@ -68,7 +69,7 @@ def test_every_number_has_an_upper_bound(model: type[BaseModel], name: str, valu
 
 def test_numbers_in_lists_have_one_too() -> None:
     boxes = [[0, 1, 0, 10**10]]
-    found, (fault,) = validate(TABLES["env"]["coverage"], node({"agents": 1, "boxes": boxes}))
+    found, (fault,) = validate(configs("env")["coverage"], node({"agents": 1, "boxes": boxes}))
     assert (found, fault.path, fault.text) == (
         None,
         "boxes.0.3",

@@ -6,12 +6,13 @@ from typing import Any
 import pytest
 
 from pipelines.specs.document import settings
+from pipelines.specs.plugins import configs
 from pipelines.specs.renamed import BLOCKS, RENAMED
 from pipelines.specs.search import Search
-from pipelines.specs.study import TABLES, Study, StudyError
+from pipelines.specs.study import Study, StudyError
 from rhmc.training import trainer
 
-OWNERS: dict[str, tuple[str, Any]] = {kind: ("algo", config) for kind, config in TABLES["algo"].items()}
+OWNERS: dict[str, tuple[str, Any]] = {kind: ("algo", config) for kind, config in configs("algo").items()}
 OWNERS["trainer"] = ("trainer", trainer.Config)
 ROWS = [
     (kind, old, new)

@@ -4,8 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.specs.include import SHIPPED
-from pipelines.specs.shipped import copy, names
+from pipelines.specs.include import SHIPPED, copy, shipped
 from pipelines.specs.study import Study
 from pipelines.workspace.errors import InputError
 
@@ -13,11 +12,11 @@ ROOT = Path(__file__).parents[3]
 
 
 def test_the_package_brings_every_study_of_the_repository() -> None:
-    assert names() == sorted(path.stem for path in (ROOT / "studies").glob("*.yaml"))
+    assert shipped() == sorted(path.stem for path in (ROOT / "studies").glob("*.yaml"))
     assert SHIPPED.resolve() == ROOT / "studies"
 
 
-@pytest.mark.parametrize("name", [name for name in names() if not name.startswith("search_")])
+@pytest.mark.parametrize("name", [name for name in shipped() if not name.startswith("search_")])
 def test_a_copied_study_is_the_study(name: str, tmp_path: Path) -> None:
     file, *_ = copy(name, tmp_path / "studies")
     assert file == tmp_path / "studies" / f"{name}.yaml"

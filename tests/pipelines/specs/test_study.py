@@ -423,12 +423,14 @@ def test_an_unknown_variant() -> None:
 
 # Faulty files. Each: what is written instead of what, and what is said, `...` for a long list in the middle.
 
-EMPTY = "1:1: empty; a study has question, base, arms, grid, readings, variants, seeds, steps, profiles, resources"
+EMPTY = (
+    "1:1: empty; a study has question, base, arms, grid, readings, variants, seeds, steps, profiles, resources, imports"
+)
 WHOLE = [
     ("", EMPTY),
     ("# nothing\n", EMPTY),
-    ("- 1\n", "1:1: [1] is not a study; must be a mapping with ... steps, profiles, resources"),
-    ("  hello\n", "1:3: 'hello' is not a study; must be a mapping with ... steps, profiles, resources"),
+    ("- 1\n", "1:1: [1] is not a study; must be a mapping with ... steps, profiles, resources, imports"),
+    ("  hello\n", "1:3: 'hello' is not a study; must be a mapping with ... steps, profiles, resources, imports"),
     ("question: [1,\n", "2:1: not YAML: expected the node content, ... (while parsing a flow node)"),
     ("base:\n\tenv: {}\n", "2:1: not YAML: a TAB; indent with spaces"),
     ("question: a: b\n", "1:12: not YAML: mapping values are not allowed here"),
