@@ -38,7 +38,7 @@ autoapi_add_toctree_entry = False
 autoapi_keep_files = True
 
 CONTENTS = {
-    "Tutorials": ["docs/walkthrough", "docs/search", "docs/pettingzoo", "docs/scaling"],
+    "Tutorials": ["docs/walkthrough", "docs/search", "docs/extending", "docs/pettingzoo", "docs/scaling"],
     "Concepts": [
         *("docs/reproducibility", "docs/report", "docs/deviations", "docs/theorem1", "docs/faults", "SECURITY"),
         "docs/overhead",

@@ -19,8 +19,8 @@ from pipelines.specs.safe_names import simple
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.own_packages import NotImportedError, bring, load, load_taken, names, top_of
 from rhmc.algorithms import ALGORITHMS, Method
-from rhmc.algorithms.acting import ACTS_ON
 from rhmc.envs import ENVS, EnvConfig, Task
+from rhmc.learning.acting import ACTS_ON
 from rhmc.yardsticks import BOUNDS, OFFERS, POLICIES
 
 PROJECT = "rhmc"  # whose kinds are always there

@@ -16,8 +16,8 @@ from pipelines.workspace.errors import InputError
 from pipelines.workspace.files import regular
 from pipelines.workspace.work_folder import DamagedError, load_whole, one_line, save_atomically, without_replay
 from rhmc.algorithms import ALGORITHMS
-from rhmc.algorithms.acting import ACTS_ON
 from rhmc.envs import ENVS, EnvConfig
+from rhmc.learning.acting import ACTS_ON
 from rhmc.types import Batch, Carry, Obs, Spec, State
 
 FILE, CONFIG = "policy.pt", "config.yaml"  # what a run keeps

@@ -23,7 +23,7 @@ from pipelines.workspace.work_folder import StoreError, load_whole
 from reports.data.drawn import read_units
 from reports.data.frame import Results
 from reports.render.figures import per
-from rhmc.algorithms.acting import ACTS_ON, register_acting
+from rhmc.learning.acting import ACTS_ON, register_acting
 from rhmc.training.trainer import Trainer
 from rhmc.yardsticks.scores import names, play_yardsticks
 from tests.pipelines.own_package import STUDY, untouched, write
