@@ -38,9 +38,24 @@ autoapi_add_toctree_entry = False
 autoapi_keep_files = True
 
 CONTENTS = {
-    "Tutorials": ["docs/walkthrough", "docs/search", "docs/extending", "docs/pettingzoo", "docs/scaling"],
+    "Tutorials": [
+        "docs/reproduce",
+        "docs/walkthrough",
+        "docs/search",
+        "docs/extending",
+        "docs/pettingzoo",
+        "docs/scaling",
+    ],
     "Concepts": [
-        *("docs/reproducibility", "docs/report", "docs/deviations", "docs/theorem1", "docs/faults", "SECURITY"),
+        *(
+            "docs/reproducibility",
+            "docs/readings",
+            "docs/report",
+            "docs/deviations",
+            "docs/theorem1",
+            "docs/faults",
+            "SECURITY",
+        ),
         "docs/overhead",
     ],
     "Results": ["docs/learning", f"{RESULTS}/index", "docs/speed"],
