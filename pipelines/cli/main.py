@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from pipelines.cli import doctor, evaluate, render, science, search, status, study, ui, verify, yardsticks
+from pipelines.cli import conformance, doctor, evaluate, render, science, search, status, study, ui, verify, yardsticks
 from pipelines.workspace import streams
 from pipelines.workspace.addresses import reach_loopback, scrubbed
 from pipelines.workspace.errors import InputError, visible
@@ -96,6 +96,7 @@ app.command("ui", rich_help_panel=RESULTS)(ui.ui)
 app.command("theorem", rich_help_panel=RESULTS)(science.theorem)
 app.command("methods", rich_help_panel=CODE)(science.methods)
 app.command("tasks", rich_help_panel=CODE)(science.tasks)
+app.command("conformance", rich_help_panel=CODE)(conformance.conformance)
 app.command("drawings", rich_help_panel=CODE)(science.drawings)
 app.command("profile", rich_help_panel=CODE)(science.profile)
 app.command("fingerprint", rich_help_panel=CODE)(science.fingerprint)
