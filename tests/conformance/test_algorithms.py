@@ -385,7 +385,7 @@ def test_actions_are_actions_and_nothing_given_is_changed(case: Case, explore: b
     env, obs = world(case.env, batch=6)
     algo = build(case.algo, env)
     carry = algo.carry(6)
-    given = deepcopy({"obs": obs._asdict(), "carry": carry, "algo": algo.state_dict()})
+    given = copied({"obs": obs._asdict(), "carry": carry, "algo": algo.state_dict()})
     rng = seeded()
     action, after, extra = algo.act(obs, carry, rng, explore=explore)
     assert explore or torch.equal(rng.get_state(), seeded().get_state())  # greedy acting draws nothing
