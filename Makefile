@@ -88,8 +88,8 @@ clean: ## Remove .venv and caches; results stay
 	@find rhmc pipelines reports benchmarks tests -name __pycache__ -prune -exec rm -rf {} +
 	@echo "Removed .venv and the caches. Kept every result: work/ (runs, checkpoints) and results/ (remove by hand)."
 
-# torch comes first and alone, so that a build with CUDA is seen before its packages are fetched. All is compiled at the
-# end, by every processor, but the packages' own tests; some files are for other versions of Python.
+# torch comes first and alone, so that a build with CUDA is seen before its packages are fetched. Nothing is compiled
+# here: two thirds of the packages' code is never imported, and Python keeps what it compiles of the rest.
 $(READY): requirements.lock pyproject.toml
 	@test -n "$(PYTHON)" || { echo "Python 3.11, 3.12 or 3.13 is needed, and none is on the path." \
 	  "Give its path: make PYTHON=/path/to/python3.11"; exit 1; }
@@ -103,5 +103,4 @@ $(READY): requirements.lock pyproject.toml
 	@python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	@python .ci/cpu_only.py
 	@python -m pip check
-	@python -m compileall -qq -j 0 -x '/tests?/' .venv/lib || true
 	@touch $(READY)

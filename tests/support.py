@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Callable
+from copy import copy
 from typing import Any
 
 import torch
@@ -49,6 +50,17 @@ def through_a_file(state: Any) -> Any:
     torch.save(state, file)
     file.seek(0)
     return torch.load(file, weights_only=True)
+
+
+def copied(state: Any) -> Any:
+    """The same content in new dicts, lists and tensors of the same kinds, in less time than `copy.deepcopy` takes."""
+    if isinstance(state, dict):
+        fresh = copy(state)
+        fresh.update({key: copied(value) for key, value in state.items()})
+        return fresh
+    if isinstance(state, list | tuple):
+        return type(state)(map(copied, state))
+    return state.clone() if isinstance(state, Tensor) else state
 
 
 def changing(text: str) -> Callable[[str, str], str]:

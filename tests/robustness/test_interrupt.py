@@ -26,7 +26,7 @@ from tests.pipelines.support import all_end, interrupt, lasting, started_by, tin
 from tests.robustness.chaos import WORKER, launch_here
 
 pytestmark = pytest.mark.ray
-POINTS = 16
+POINTS = 12
 STUDY = lasting(tiny(points=POINTS, concurrent=1))
 
 

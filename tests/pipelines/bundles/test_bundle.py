@@ -819,9 +819,9 @@ def test_more_files_or_bytes_than_are_taken_in(bundle: Path, there: Path, monkey
 def test_a_table_that_lies_about_its_size_finds_no_memory(
     bundle: Path, there: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The head of the table says nothing of the page of half a gigabyte that follows; the system does."""
-    size = 2**29 - 2**20
-    monkeypatch.setattr(bundle_files.limited.__wrapped__, "__defaults__", (2**30,))
+    """The head of the table says nothing of the page of a quarter of a gigabyte that follows; the system does."""
+    size = 2**28 - 2**20
+    monkeypatch.setattr(bundle_files.limited.__wrapped__, "__defaults__", (2**29,))
     column = pa.array(["x" * size], pa.string())
     row = pq.read_table(bundle / "runs.parquet").slice(0, 1)
     at = row.column_names.index("config")
@@ -834,7 +834,7 @@ def test_a_table_that_lies_about_its_size_finds_no_memory(
     assert content.count(told) == 1
     assert len(told) == len(small)
     (bundle / "runs.parquet").write_bytes(content.replace(told, small))
-    assert_refused(bundle, there, r"runs\.parquet: (not a parquet table|config: 535,822,336 characters)")
+    assert_refused(bundle, there, r"runs\.parquet: (not a parquet table|config: 267,386,880 characters)")
 
 
 def varint(number: int) -> bytes:

@@ -36,6 +36,7 @@ from tests.pipelines.support import setting, spec
 from tests.robustness.chaos import DAMAGES, damaged
 
 Start = Callable[..., RunTrainable]
+Points = list[dict[str, float]]  # of a run, each with its values
 
 
 def job(folder: Path, seed: int = 0, every: int = 1) -> dict[str, Any]:
@@ -61,9 +62,15 @@ def finish(run: RunTrainable) -> list[dict[str, Any]]:
     return results
 
 
-def points(results: list[dict[str, Any]]) -> list[dict[str, float]]:
+def points(results: list[dict[str, Any]]) -> Points:
     """The values of training, clocks aside."""
     return [{k: v for k, v in p.items() if not k.startswith("time/")} for r in results for p in r["points"]]
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory: pytest.TempPathFactory) -> Points:
+    """The values of a run that nobody disturbed. Not to be changed."""
+    return points(finish(RunTrainable(job(tmp_path_factory.mktemp("whole")))))
 
 
 def same(a: Any, b: Any) -> bool:
@@ -113,8 +120,9 @@ def test_a_run_whose_end_was_never_logged_only_tells_its_history(start: Start) -
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
-def test_a_damaged_checkpoint_falls_back_to_the_one_before(start: Start, tmp_path: Path, damage: str) -> None:
-    expected = points(finish(start("whole")))
+def test_a_damaged_checkpoint_falls_back_to_the_one_before(
+    start: Start, tmp_path: Path, damage: str, expected: Points
+) -> None:
     first = start()
     for _ in range(3):
         first.step()
@@ -177,9 +185,8 @@ SHORTAGES: dict[str, tuple[str, Callable[..., Any], str]] = {  # name -> what is
 
 @pytest.mark.parametrize("kind", SHORTAGES)
 def test_a_shortage_touches_no_checkpoint(
-    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, expected: Points
 ) -> None:
-    expected = points(finish(start("whole")))
     first = start()
     for _ in range(3):
         first.step()
@@ -236,8 +243,7 @@ def test_checkpoints_of_another_run_are_left_alone(start: Start, tmp_path: Path)
     assert (tmp_path / "a" / "run1" / "00000001.pt").read_bytes() == (folder / "00000001.pt").read_bytes()
 
 
-def test_two_damaged_checkpoints_are_a_new_start(start: Start, tmp_path: Path) -> None:
-    expected = points(finish(start("whole")))
+def test_two_damaged_checkpoints_are_a_new_start(start: Start, tmp_path: Path, expected: Points) -> None:
     first = start()
     for _ in range(3):
         first.step()
@@ -518,8 +524,7 @@ def test_a_run_is_trained_by_one_process_at_a_time(start: Start, monkeypatch: py
     assert len(start().step()["points"]) == 1
 
 
-def test_rays_own_checkpoints_hold_the_same(start: Start, tmp_path: Path) -> None:
-    expected = points(finish(start("whole")))
+def test_rays_own_checkpoints_hold_the_same(start: Start, tmp_path: Path, expected: Points) -> None:
     run = start(every=100)
     run.step()
     run.step()

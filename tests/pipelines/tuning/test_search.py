@@ -688,7 +688,7 @@ for _name in [
 @pytest.mark.parametrize("pruner", [MEDIAN, ASHA])
 def test_a_kill_at_any_write_changes_nothing(tmp_path: Path, pruner: str) -> None:
     one_arm = GOOD[: GOOD.index("  VDN")] + GOOD[GOOD.index("trials:") :]
-    search = load(one_arm + pruner, "quick", "trials=4")
+    search = load(one_arm + pruner, "quick", "trials=3")
     whole = World(search, tmp_path)
     whole.launch()
     expected = whole.outcome()
