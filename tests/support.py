@@ -1,9 +1,6 @@
 """Parts that tests of several rooms build from: generators, observations, and networks with known outputs."""
 
-import io
 from collections.abc import Callable
-from copy import copy
-from typing import Any
 
 import torch
 from torch import Generator, Tensor, nn
@@ -42,25 +39,6 @@ def constant(net: nn.Module, out: list[float]) -> Tensor:
             p.zero_()
         weights[-1].copy_(torch.tensor(out).expand_as(weights[-1].view(-1, len(out))).reshape(weights[-1].shape))
     return weights[-1]
-
-
-def through_a_file(state: Any) -> Any:
-    """The content of a checkpoint after it was written and read, by the reader that runs no code."""
-    file = io.BytesIO()
-    torch.save(state, file)
-    file.seek(0)
-    return torch.load(file, weights_only=True)
-
-
-def copied(state: Any) -> Any:
-    """The same content in new dicts, lists and tensors of the same kinds, in less time than `copy.deepcopy` takes."""
-    if isinstance(state, dict):
-        fresh = copy(state)
-        fresh.update({key: copied(value) for key, value in state.items()})
-        return fresh
-    if isinstance(state, list | tuple):
-        return type(state)(map(copied, state))
-    return state.clone() if isinstance(state, Tensor) else state
 
 
 def changing(text: str) -> Callable[[str, str], str]:

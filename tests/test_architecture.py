@@ -54,13 +54,24 @@ ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
     "pipelines": {
         "workspace": (),
         "specs": ("workspace",),
+        "conformance": ("workspace", "specs"),
         "tracking": ("workspace", "specs"),
         "export": ("workspace", "specs", "tracking"),
         "policies": ("workspace", "specs", "tracking", "export"),
         "execution": ("workspace", "specs", "tracking", "policies"),
         "bundles": ("workspace", "specs", "tracking", "export", "execution"),
         "tuning": ("workspace", "specs", "tracking", "export", "execution"),
-        "cli": ("workspace", "specs", "tracking", "export", "policies", "execution", "bundles", "tuning"),
+        "cli": (
+            "workspace",
+            "specs",
+            "conformance",
+            "tracking",
+            "export",
+            "policies",
+            "execution",
+            "bundles",
+            "tuning",
+        ),
     },
     "reports": {
         "data": (),
@@ -72,7 +83,7 @@ ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
 }
 FULL = 16  # modules of a room
 VERBS = (
-    *("common", "doctor", "evaluate", "main", "reference", "render", "science", "search"),
+    *("common", "conformance", "doctor", "evaluate", "main", "reference", "render", "science", "search"),
     *("status", "study", "ui", "verify", "yardsticks"),
 )
 # What writes words of users where they are read: these take `reports.data.escaping` and `reports.render.glyphs` alone.

@@ -43,8 +43,9 @@ def assert_same(a: Any, b: Any, at: str = "state") -> int:
 def _same_tensor(a: Tensor, b: Tensor, at: str) -> None:
     if (a.dtype, a.shape) != (b.dtype, b.shape):
         raise DifferentError(f"{at}: {a.dtype} {tuple(a.shape)} and {b.dtype} {tuple(b.shape)}")
-    wrong = _bits(a) != _bits(b)
-    if bool(wrong.any()):
+    ours, theirs = _bits(a), _bits(b)
+    if not torch.equal(ours, theirs):
+        wrong = ours != theirs
         raise DifferentError(f"{at}: {int(wrong.sum())} of {wrong.numel()} bytes differ")
 
 

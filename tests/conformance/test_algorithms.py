@@ -12,6 +12,9 @@ from torch import Generator, Tensor
 from torch.nn import functional
 from torch.overrides import TorchFunctionMode
 
+from pipelines.conformance import toy
+from pipelines.conformance.checks import through_a_file
+from pipelines.conformance.same import DifferentError, assert_same
 from pipelines.specs.document import settings
 from pipelines.tracking.plan import flatten
 from rhmc.algorithms import ALGORITHMS
@@ -21,10 +24,8 @@ from rhmc.learning.learner import Learner, Replay
 from rhmc.networks.nets import Unshared
 from rhmc.training.trainer import Config, Trainer
 from rhmc.types import Batch, Obs, Transition
-from tests import toy
 from tests.blocks import fitted, nested
-from tests.conformance import DifferentError, assert_same
-from tests.support import copied, reordered, seeded, through_a_file
+from tests.support import copied, reordered, seeded
 
 EPISODE = 7  # of both tasks here, so that runs of a few steps cross its end
 SMALL = {
@@ -683,7 +684,7 @@ def returns(kind: str, **changes: Any) -> Iterator[float]:
     wanted = LEARNING | LEARNING_OF.get(kind, {})
     known = fitted(config, wanted)
     run = Trainer(
-        toy.Config(),  # type: ignore[arg-type]
+        toy.Config(),
         config(**nested(known | changes)),
         Config(steps=STEPS.get(kind, 12_000), num_envs=32, evaluations=36, eval_episodes=300, final_episodes=1),
         seed=0,

@@ -5,10 +5,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from pipelines.conformance import toy
 from pipelines.specs import plugins
 from pipelines.workspace import own_packages
 from pipelines.workspace.own_packages import top_of
-from tests import toy
 
 NAME = "bandits"
 METHOD = '''"""A value for each action of each agent, whatever it observes."""

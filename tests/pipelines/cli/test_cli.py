@@ -754,6 +754,10 @@ def test_methods_and_tasks_show_one_by_its_kind(rhmc: Rhmc) -> None:
     ("words", "said"),
     [
         (["methods", "comma"], "'comma' is no method; allowed: rhmc, qmix, vdn, iql, maddpg, coma"),
+        (["conformance"], "nothing to check: name a module, or --method, or --task"),
+        (["conformance", "--method", "iqll"], "--method: 'iqll' is not allowed; allowed: rhmc, qmix"),
+        (["conformance", "--method", "iql", "--set", "gamm=1"], "--set: iql: gamm: Extra inputs are not permitted"),
+        (["conformance", "--method", "iql", "--set", "gamma"], "--set gamma: must be KEY=VALUE, as in gamma=0.8"),
         (["tasks", "coverag"], "'coverag' is no task; allowed: coverage, navigation; did you mean 'coverage'?"),
         (["methods", "coma", "--out", "o"], "--out: belongs to the table of all methods; leave the method out"),
     ],

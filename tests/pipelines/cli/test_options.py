@@ -106,6 +106,16 @@ CASES = [
         ("export_marl_eval(x@large, r, o)",),
     ),
     Case(
+        "conformance --method iql --set gamma=0.5 --steps 7 --json",
+        {"pipelines.conformance.methods.check_method": []},
+        ("check_method(iql, {'gamma': 0.5}, 7)",),
+    ),
+    Case(
+        "conformance --task coverage --set agents=6",
+        {"pipelines.conformance.tasks.check_task": []},
+        ("check_task(coverage, {'agents': 6})",),
+    ),
+    Case(
         "theorem --instances 7 --seed 3 --alpha 0.5 --out o",
         {
             "rhmc.hierarchy.theorem.shortfall_table": "found",

@@ -6,15 +6,15 @@ from pathlib import Path
 
 import pytest
 
+from pipelines.conformance.checks import through_a_file
+from pipelines.conformance.same import assert_same
 from pipelines.policies.render import episode_gif
 from pipelines.specs import identity
 from pipelines.specs.study import Study
 from pipelines.tracking.policy import Saved
 from rhmc.training.trainer import Trainer
 from rhmc.yardsticks.scores import play_yardsticks
-from tests.conformance import assert_same
 from tests.pipelines.own_package import untouched
-from tests.support import through_a_file
 
 PAGE = (Path(__file__).parents[3] / "docs/extending.md").read_text(encoding="utf-8")
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Size, Tensor, nn
 
+from pipelines.conformance.same import assert_same
 from rhmc.algorithms.maddpg import MADDPG, Config
 from rhmc.envs import make_env, navigation
 from rhmc.envs.base import Env
@@ -15,7 +16,6 @@ from rhmc.networks.sampling import gumbel, straight_through
 from rhmc.training.trainer import Config as Run
 from rhmc.training.trainer import Trainer
 from rhmc.types import Batch, Obs, Spec
-from tests.conformance import assert_same
 from tests.support import observation, observed, seeded
 
 N, A = 3, 2

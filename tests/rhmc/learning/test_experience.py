@@ -6,11 +6,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from pipelines.conformance.checks import through_a_file
+from pipelines.conformance.same import assert_same
 from rhmc.learning.experience import Experience, Rollout, ends, flat, values
 from rhmc.learning.settings import OffPolicy
 from rhmc.types import Batch, Local, Obs, Transition
-from tests.conformance import assert_same
-from tests.support import seeded, through_a_file
+from tests.support import seeded
 
 N, M = 2, 3
 CPU = torch.device("cpu")

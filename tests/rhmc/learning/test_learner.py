@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Generator, Tensor, nn
 
+from pipelines.conformance.same import assert_same
 from rhmc.learning.learner import Learner, Replay, pack, unpack
 from rhmc.types import Obs
-from tests.conformance import assert_same
 
 
 def labelled(values: list[int]) -> dict[str, Tensor]:

@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from pipelines.conformance.same import assert_same
 from rhmc.learning.normalisation import KEPT, LEAST, Standardiser
-from tests.conformance import assert_same
 
 CPU = torch.device("cpu")
 batches = st.lists(

@@ -10,6 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Generator, Tensor, nn
 
+from pipelines.conformance import toy
+from pipelines.conformance.same import assert_same
 from rhmc.algorithms import ALGORITHMS
 from rhmc.algorithms import rhmc as rhmc_page
 from rhmc.algorithms.base import Method
@@ -17,9 +19,7 @@ from rhmc.envs import ENVS, Task
 from rhmc.learning.learner import Learner, Learners
 from rhmc.training.trainer import Config, Means, Trainer, grid_step
 from rhmc.types import Frozen, Metrics, Obs, Spec, Transition
-from tests import toy
 from tests.blocks import fitted, nested
-from tests.conformance import assert_same
 
 ENVIRONMENTS = 4
 
