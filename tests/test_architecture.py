@@ -83,7 +83,7 @@ ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
 }
 FULL = 16  # modules of a room
 VERBS = (
-    *("common", "conformance", "doctor", "evaluate", "main", "reference", "render", "science", "search"),
+    *("common", "conformance", "doctor", "evaluate", "main", "new", "reference", "render", "science", "search"),
     *("status", "study", "ui", "verify", "yardsticks"),
 )
 # What writes words of users where they are read: these take `reports.data.escaping` and `reports.render.glyphs` alone.

@@ -16,7 +16,20 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from pipelines.cli import conformance, doctor, evaluate, render, science, search, status, study, ui, verify, yardsticks
+from pipelines.cli import (
+    conformance,
+    doctor,
+    evaluate,
+    new,
+    render,
+    science,
+    search,
+    status,
+    study,
+    ui,
+    verify,
+    yardsticks,
+)
 from pipelines.workspace import streams
 from pipelines.workspace.addresses import reach_loopback, scrubbed
 from pipelines.workspace.errors import InputError, visible
@@ -84,6 +97,7 @@ app.add_typer(study.app, name="study")
 app.add_typer(search.app, name="search")
 app.add_typer(yardsticks.app, name="yardsticks")
 app.command("status", rich_help_panel=RESULTS)(status.status)
+app.add_typer(new.app, name="new")
 app.command("evaluate", rich_help_panel=RESULTS)(evaluate.evaluate)
 app.command("transfer", rich_help_panel=RESULTS)(evaluate.transfer)
 app.command("assignments", rich_help_panel=RESULTS)(evaluate.assignments)

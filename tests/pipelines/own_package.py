@@ -84,10 +84,8 @@ TASK = (
     Path(toy.__file__)
     .read_text(encoding="utf-8")
     .replace("from math import pi\n", "import sys\nfrom math import pi\n")
-    .replace("from rhmc.envs.base import Outcome", "from rhmc.envs.base import EnvConfig, Outcome, Task, register_task")
-    .replace("from rhmc.types import Frozen, Local", "from rhmc.types import Local")
-    .replace("class Config(Frozen):", "class Config(EnvConfig):")
-    .replace('kind: Literal["toy"] = "toy"', 'kind: Literal["ring"] = "ring"\n    observation: str = "paper"')
+    .replace("import EnvConfig, Outcome", "import EnvConfig, Outcome, Task, register_task")
+    .replace('kind: Literal["toy"] = "toy"', 'kind: Literal["ring"] = "ring"')
     + '\n\nregister_task("ring", Task(Config, sys.modules[__name__]))\n'
 )
 OFFERS = """

@@ -106,6 +106,16 @@ CASES = [
         ("export_marl_eval(x@large, r, o)",),
     ),
     Case(
+        "new method mine --out o",
+        {"pipelines.conformance.scaffold.create": (Path("o/mine/mine/method.py"),)},
+        ("create(method, mine, o)",),
+    ),
+    Case(
+        "new task mine --out o",
+        {"pipelines.conformance.scaffold.create": (Path("o/mine/mine/task.py"),)},
+        ("create(task, mine, o)",),
+    ),
+    Case(
         "conformance --method iql --set gamma=0.5 --steps 7 --json",
         {"pipelines.conformance.methods.check_method": []},
         ("check_method(iql, {'gamma': 0.5}, 7)",),
