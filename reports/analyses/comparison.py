@@ -163,11 +163,10 @@ def profile(results: Results, study: str) -> Drawing | None:
         axes = figure.add_axes((0.075, 0.17, 0.6, 0.66))
         lines, names = [], []
         for arm in shares:
-            colour, dashes = look(arm, results.arms(study))
             names.append("\n".join(wrap(f"{arm} ({len(values[arm])} seeds)", LETTERS)))
             own = np.append(values[arm][:1], values[arm])  # drawn from its first seed to its last, lines apart
             left = np.append(1.0, above(values[arm], np.nextafter(values[arm], np.inf)))
-            lines += axes.step(own, left, where="post", color=colour, linestyle=dashes, linewidth=1.8)
+            lines += axes.step(own, left, where="post", linewidth=1.8, **look(arm, results.arms(study)).marked)
         axes.set_xlabel("final return")
         axes.set_ylabel("share of seeds")
         axes.set_ylim(-0.02, 1.04)

@@ -14,12 +14,13 @@ from reports.data.escaping import stem
 from reports.data.frame import FINAL, Results
 from reports.data.paper import Curves, Paper
 from reports.pages.embed import Embedded
-from reports.render import diagrams, figures, scenes
+from reports.render import diagrams, figures, panels, scenes
 from reports.render.canvas import Drawing
 from reports.render.tables import describe_task, joined, number, steps
 
 PAPERS = "fig_"
 OWN = ("RHMC", "full")  # the paper's method
+EACH = 48  # arms that have a frame each
 Made = tuple[str, str, Drawing]  # caption, text for those who cannot see it, figure
 
 
@@ -252,11 +253,11 @@ def _curves(results: Results, spec: Curves, name: str) -> Iterator[Picture]:
     """All arms in one frame, and where they are many each in a frame of its own."""
 
     def whole() -> Made | None:
-        drawing = figures.learning_curves(results, spec)
+        drawing = panels.panels(results, spec) or figures.learning_curves(results, spec)
         return (curve_caption(results, spec.study), _finals(results, spec.study), drawing) if drawing else None
 
     def each() -> Made | None:
-        drawing = figures.each_arm(results, spec)
+        drawing = figures.each_arm(results, spec) if len(results.arms(spec.study)) <= EACH else None
         caption = "The same curves one by one: see the width of each band, and where a curve bends down again."
         return (caption, f"Small line charts. {_finals(results, spec.study)}", drawing) if drawing else None
 
