@@ -90,8 +90,9 @@ def needed(x: Values, y: Values, alpha: float) -> int | None:
         return 2
 
     def enough(seeds: int) -> bool:
-        found = TTestIndPower().power(gap / spread, seeds, alpha)
-        return not found < POWER  # far above what is needed it is NaN: its far tail is too small for the library
+        # The side of the gap alone: the far one adds next to nothing, and is NaN where it is too small for the library.
+        found = TTestIndPower().power(gap / spread, seeds, alpha / 2, alternative="larger")
+        return not found < POWER  # NaN where it is 1 within rounding
 
     found = 2 + bisect_left(range(2, LIMIT + 1), True, key=enough)
     return found if found <= LIMIT else None
