@@ -4,6 +4,7 @@ Arms of a group have one task. In each frame stand the yardsticks of that task, 
 """
 
 from collections.abc import Mapping, Sequence
+from itertools import takewhile
 from textwrap import wrap
 from typing import Any, NamedTuple
 
@@ -115,10 +116,17 @@ def _divided(arms: list[str], keys: int) -> dict[str, list[str]]:
     if len(parts) == len(arms):
         return {}
     out: dict[str, list[str]] = {}
-    for key, own in parts.items():
+    for own in parts.values():
         smaller = _divided(own, keys + 1) if len(own) > ROOM else {}
-        out |= smaller if len(smaller) > 1 else {key: own}
+        out |= smaller if len(smaller) > 1 else {_common(own): own}
     return out
+
+
+def _common(arms: Sequence[str]) -> str:
+    """The keys that names begin with, all of them."""
+    keys = [arm.split(", ") for arm in arms]
+    same = takewhile(lambda column: len(set(column)) == 1, zip(*keys, strict=False))
+    return ", ".join(column[0] for column in same)
 
 
 def _rest(arm: str, key: str) -> str:

@@ -102,12 +102,12 @@ def grid(names: list[str]) -> Tables:
 
 def test_many_arms_are_divided_by_their_names(tmp_path: Path) -> None:
     names = [f"full, horizon {h}, alpha={a}" for h in (1, 6, 18) for a in range(5)]
-    names += [f"no filter, alpha={a}" for a in range(5)]
+    names += [f"no filter, horizon 18, alpha={a}" for a in range(5)]
     assert {key: len(own) for key, own in panels.by_name(names).items()} == {
         "full, horizon 1": 5,
         "full, horizon 6": 5,
         "full, horizon 18": 5,
-        "no filter": 5,
+        "no filter, horizon 18": 5,
     }
     drawing = panels.panels(load(write(tmp_path, grid(names)), "quick"), SPEC)
     assert drawing is not None
