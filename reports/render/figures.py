@@ -87,6 +87,7 @@ def learning_curves(results: Results, spec: Curves) -> Drawing | None:
             if late and n:
                 axes.set_xlim(late.step, axes.get_xlim()[1])
                 axes.set_ylim(late.low, late.high)
+                axes.yaxis.set_major_locator(MaxNLocator(7, steps=[1, 2, 5, 10]))  # no 2.5: its digits take room
                 axes.set_title("the same, enlarged: the part in the box above", fontsize=8.5, loc="left", color=QUIET)
             elif late:
                 axes.set_xlabel("")
