@@ -30,6 +30,7 @@ def of(report: Report) -> Mapping[str, Any]:
         "others": others,
         "claims": [page.card(claim) for claim in report.claims],
         "folded": page.FOLDED,
+        "filtered": page.FILTERED,
         "span": SPAN,
         "gaps": [words(gap) for gap in report.gaps],
         "definitions": definitions(results),

@@ -22,6 +22,7 @@ SHOWN = 2 / 3  # of a figure's pixels: all words on the page are then of one siz
 LEGIBLE = 0.43  # of a figure's pixels: letters of 9.5 points at 160 dots an inch are then 9 pixels high
 FILES: Mapping[str, str] = {"PDF": "pdf", "numbers": "csv"}
 LONG = 66  # rows of a table that are shown at once: the pairs of twelve arms
+FILTERED = 8  # rows of a table above which it has a field for words; a script makes it
 FOLDED = 6  # quantities of a claim that are shown at once
 EPISODE_WORDS: Mapping[str, str] = {
     "coverage": "Left a trained policy, its lines what its coordinator assigns; then each sensor seeking its own best "
