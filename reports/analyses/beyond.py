@@ -13,7 +13,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from reports.data.frame import ASSIGN, FINAL, Results
 from reports.data.stats import Interval, curve, difference, interval
 from reports.render.canvas import FAINT, QUIET, Drawing, blank, foot, head, look, styled
-from reports.render.figures import spread
+from reports.render.figures import MARKS, spread
 from reports.render.tables import NONE, SPAN, Table, describe_task, estimate, number, readable, seeds, spans, steps
 
 PANELS = (
@@ -60,9 +60,10 @@ def fig_assignments(results: Results, study: str) -> Drawing | None:
             axes.set_title(words, fontsize=9, loc="left")
             for arm in arms:
                 rows = curve(results.curve(study, arm, f"{ASSIGN}{metric}"))
-                colour, dashes = look(arm, results.arms(study))
-                (handles[arm],) = axes.plot(rows["step"], rows["mean"], color=colour, linestyle=dashes, linewidth=1.8)
-                axes.fill_between(rows["step"], rows["low"], rows["high"], color=colour, alpha=0.16, linewidth=0)
+                own = look(arm, results.arms(study))
+                drawn = own.marked | {"markevery": max(1, len(rows) // MARKS), "linewidth": 1.8}
+                (handles[arm],) = axes.plot(rows["step"], rows["mean"], **drawn)
+                axes.fill_between(rows["step"], rows["low"], rows["high"], color=own.colour, alpha=0.16, linewidth=0)
                 parts.append(rows.assign(arm=arm, quantity=metric))
             axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: steps(x)))
             axes.xaxis.set_major_locator(MaxNLocator(4))
@@ -256,9 +257,8 @@ def _panel(
         axes.plot(list(line), list(line.values()), color=FAINT, linestyle=dashes, linewidth=1.2, marker=".", zorder=1)
         labels.append((list(line.values())[-1], f"{readable(name)} {number(list(line.values())[-1])}", QUIET))
     for arm, by in arms.items():
-        colour, dash = look(arm, list(arms))
-        means = [x.value for x in by.values()]
-        axes.plot(list(by), means, color=colour, linestyle=dash, marker="o", markersize=4, linewidth=1.7, zorder=4)
+        colour, means = look(arm, list(arms)).colour, [x.value for x in by.values()]
+        axes.plot(list(by), means, linewidth=1.7, zorder=4, **look(arm, list(arms)).marked)
         for count, x in by.items():
             if np.isfinite(x.low):
                 axes.plot([count, count], [x.low, x.high], color=colour, linewidth=1.2, alpha=0.6, zorder=3)

@@ -4,7 +4,7 @@ All of it is over seeds. Every run of a study plays the same evaluation episodes
 for all arms and cancels in a difference; single episodes are not exported, so there is nothing to pair below a seed.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import combinations
 from math import comb
 from textwrap import wrap
@@ -12,15 +12,18 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from reports.data.frame import FINAL, Results
 from reports.data.stats import Interval, area, difference, first_at, holm, improvement, interval, welch
 from reports.render.canvas import Drawing, blank, foot, head, look, styled
-from reports.render.tables import MEASURED, NONE, SPAN, Table, estimate, number, steps
+from reports.render.tables import MEASURED, NONE, SPAN, Table, estimate, joined, number, steps
 
 LETTERS, LONGEST = 44, 60  # of a name on a line of a legend, and beside a matrix
 MOST = 12  # arms of a matrix that can still be read
+MANY = MOST * (MOST - 1) // 2  # pairs of a table that is read from its beginning to its end
+CLEAR = 0.05  # p after Holm's correction
 LEVEL_SHARE = 0.9  # of the best arm's mean final return, where no yardstick gives a level
 LEVEL_YARDSTICK = {"coverage": "best_window", "navigation": "nearest"}  # each agent alone, without learning
 
@@ -50,8 +53,15 @@ def compared(results: Results, study: str) -> list[str]:
 
 
 def pairs(results: Results, study: str) -> list[Pair]:
-    """Every two arms, the better one first."""
-    found = list(combinations(compared(results, study), 2))
+    """Every two arms of one task, the better one first."""
+    if study not in (kept := results.memo.setdefault("pairs", {})):
+        kept[study] = _pairs(results, study)
+    return list(kept[study])
+
+
+def _pairs(results: Results, study: str) -> list[Pair]:
+    task = {arm: n for n, (_, arms) in enumerate(results.by_task(study)) for arm in arms}
+    found = [(a, b) for a, b in combinations(compared(results, study), 2) if task[a] == task[b]]
     values = [(results.finals(study, a), results.finals(study, b)) for a, b in found]
     p = np.array([welch(x, y) for x, y in values])
     return [
@@ -61,10 +71,12 @@ def pairs(results: Results, study: str) -> list[Pair]:
 
 
 def pairs_table(results: Results, study: str) -> Table | None:
-    """The pairs as a table; None with fewer than two arms to compare."""
+    """The pairs as a table, of many the clear ones first; None with fewer than two arms to compare."""
     found = pairs(results, study)
     if not found:
         return None
+    if len(found) > MANY:
+        found.sort(key=lambda x: not x.corrected < CLEAR)
     numbers = [
         {"study": study, "better": x.first, "other": x.second}
         | {"difference": x.difference.value, "difference_low": x.difference.low, "difference_high": x.difference.high}
@@ -80,7 +92,7 @@ def pairs_table(results: Results, study: str) -> Table | None:
             "P(first better) [95 %]": estimate(x.better, lambda v: f"{v:.2f}"),
             "p": _chance(x.p),
             "p, Holm": _chance(x.corrected),
-            "Clear": "yes" if x.corrected < 0.05 else "no" if x.corrected >= 0.05 else NONE,
+            "Clear": "yes" if x.corrected < CLEAR else "no" if x.corrected >= CLEAR else NONE,
             "Seeds": str(x.difference.n),
         }
         for x in found
@@ -89,13 +101,14 @@ def pairs_table(results: Results, study: str) -> Table | None:
 
 
 def efficiency(results: Results, study: str) -> Table | None:
-    """Mean height of the learning curve, and steps to a level; None without finished runs."""
-    level = reference(results, study)
-    rows = [(arm, runs) for arm in results.arms(study) if len(runs := _learned(results, study, arm, level))]
-    if level is None or not rows:
+    """Mean height of the learning curve, and steps to the level of its task; None without finished runs."""
+    levels = {arm: level for arm in results.arms(study) if (level := reference(results, study, arm))}
+    rows = [(arm, runs) for arm in levels if len(runs := _learned(results, study, arm, levels[arm]))]
+    if not rows:
         return None
     numbers, shown = [], []
     for arm, runs in rows:
+        level = levels[arm]
         height, reached = interval(runs["area"].to_numpy()), runs["steps"].notna()
         steps_to, all_reached = runs["steps"].median(), bool(reached.all())
         numbers.append(
@@ -112,7 +125,7 @@ def efficiency(results: Results, study: str) -> Table | None:
             }
         )
     note = (
-        f"Level: {number(level.value)}, {level.words}. Steps: to each finished seed's first evaluation at or above it, "
+        f"{_levels(levels[arm] for arm, _ in rows)} Steps: to each finished seed's first evaluation at or above it, "
         "given where every seed reaches it."
     )
     return Table(f"Sample efficiency, study {study}", pd.DataFrame(numbers), pd.DataFrame(shown), note)
@@ -120,37 +133,52 @@ def efficiency(results: Results, study: str) -> Table | None:
 
 def time_to_level(results: Results, study: str) -> Table | None:
     """Processor time to the level of `efficiency`; None where there is no level, or of no arm a time."""
-    level = reference(results, study)
-    found = {arm: _learned(results, study, arm, level) for arm in results.arms(study)}
+    levels = {arm: reference(results, study, arm) for arm in results.arms(study)}
+    found = {arm: _learned(results, study, arm, level) for arm, level in levels.items()}
     medians = {arm: float(runs["seconds"].median(skipna=False)) for arm, runs in found.items() if len(runs)}
-    if level is None or np.isnan(list(medians.values())).all():
+    if np.isnan(list(medians.values())).all():
         return None
     numbers = pd.DataFrame({"study": study, "arm": list(medians), "median_seconds": list(medians.values())})
     words = [NONE if np.isnan(x) else f"{x:.0f} s" for x in medians.values()]
     shown = pd.DataFrame({"Arm": list(medians), "Processor time to it, median": words})
     note = (
-        f"Level: {number(level.value)}, {level.words}. The share of a run's seconds that its steps to the level are, "
+        f"{_levels(level for arm in medians if (level := levels[arm]))} "
+        "The share of a run's seconds that its steps to the level are, "
         "given where every seed reaches it."
     )
     return Table(f"Processor time to the level, study {study}", numbers, shown, note, folder=MEASURED)
 
 
-def reference(results: Results, study: str) -> Level | None:
-    """The level of `efficiency`: each agent alone without learning, else 90 % of the best arm; None without runs."""
-    scores = results.yardsticks_of(study)
-    name = LEVEL_YARDSTICK.get(str(results.env(study).get("kind")), "")
+def _levels(found: Iterable[Level]) -> str:
+    """The levels of arms in a sentence."""
+    every = list(dict.fromkeys(found))
+    values = joined(number(level.value) for level in every)
+    words = joined(dict.fromkeys(level.words for level in every))
+    return f"Level{'s, of each task its own' * (len(every) > 1)}: {values}, {words}."
+
+
+def reference(results: Results, study: str, arm: str | None = None) -> Level | None:
+    """The level of `efficiency`: each agent alone without learning, else 90 % of the best arm; None without runs.
+
+    arm: in whose task; None for the one of all arms, of which there may be none.
+    """
+    tasks = [(env, arms) for env, arms in results.by_task(study) if arm is None or arm in arms]
+    if len(tasks) != 1:
+        return None
+    env, arms = tasks[0]
+    scores, name = results.yardsticks_on(env), LEVEL_YARDSTICK.get(str(env.get("kind")), "")
     if FINAL in scores and name in scores.index:
         return Level(float(scores[FINAL][name]), f"the score of the yardstick {name.replace('_', ' ')}")
-    means = [float(values.mean()) for arm in results.arms(study) if len(values := results.finals(study, arm))]
+    means = [float(values.mean()) for one in arms if len(values := results.finals(study, one))]
     if not means or max(means) <= 0:
         return None
     return Level(LEVEL_SHARE * max(means), f"{100 * LEVEL_SHARE:g} % of the best arm's mean final return")
 
 
 def profile(results: Results, study: str) -> Drawing | None:
-    """Share of seeds whose final return is at or above a score, for every score; None with fewer than two arms."""
+    """Share of seeds that end at or above a score, for every score; None with fewer than two arms, or several tasks."""
     arms = [arm for arm in results.arms(study) if len(results.finals(study, arm)) > 1]
-    if len(arms) < 2:
+    if len(arms) < 2 or len(results.by_task(study)) > 1:
         return None
     values = {arm: np.sort(results.finals(study, arm)) for arm in arms}
     low, high = min(x[0] for x in values.values()), max(x[-1] for x in values.values())
@@ -158,26 +186,29 @@ def profile(results: Results, study: str) -> Drawing | None:
     grid = np.unique(np.concatenate([*values.values(), [low - margin, high + margin]]))
     shares = {arm: above(x, grid) for arm, x in values.items()}
     with styled():
-        figure = blank(9.0, 4.6)
+        rows = [wrap(f"{arm} ({len(values[arm])} seeds)", LETTERS) for arm in shares]
+        height = max(4.6, 1.6 + 0.155 * sum(map(len, rows)))
+        figure = blank(9.0, height)
         head(figure, f"Performance profile, study {study}", "share of seeds that end at or above a score")
-        axes = figure.add_axes((0.075, 0.17, 0.6, 0.66))
-        lines, names = [], []
+        axes = figure.add_axes((0.075, 0.78 / height, 0.6, 1 - 1.56 / height))
+        lines: list[Line2D] = []
+        names = ["\n".join(row) for row in rows]
         for arm in shares:
-            colour, dashes = look(arm, results.arms(study))
-            names.append("\n".join(wrap(f"{arm} ({len(values[arm])} seeds)", LETTERS)))
             own = np.append(values[arm][:1], values[arm])  # drawn from its first seed to its last, lines apart
             left = np.append(1.0, above(values[arm], np.nextafter(values[arm], np.inf)))
-            lines += axes.step(own, left, where="post", color=colour, linestyle=dashes, linewidth=1.8)
+            lines += axes.step(own, left, where="post", linewidth=1.8, **look(arm, results.arms(study)).marked)
         axes.set_xlabel("final return")
         axes.set_ylabel("share of seeds")
         axes.set_ylim(-0.02, 1.04)
-        figure.legend(lines, names, loc="upper left", bbox_to_anchor=(0.69, 0.85), frameon=False, fontsize=8)
+        figure.legend(
+            lines, names, loc="upper left", bbox_to_anchor=(0.69, 1 - 0.69 / height), frameon=False, fontsize=8
+        )
         foot(
             figure,
             "A line right of another at every height is better in distribution; lines that cross are not ordered.",
         )
-    rows = [(arm, x, y, len(values[arm])) for arm, share in shares.items() for x, y in zip(grid, share, strict=True)]
-    return Drawing(figure, pd.DataFrame(rows, columns=["arm", "score", "share", "seeds"]))
+    points = [(arm, x, y, len(values[arm])) for arm, share in shares.items() for x, y in zip(grid, share, strict=True)]
+    return Drawing(figure, pd.DataFrame(points, columns=["arm", "score", "share", "seeds"]))
 
 
 def above(values: NDArray[np.float64], scores: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -186,9 +217,9 @@ def above(values: NDArray[np.float64], scores: NDArray[np.float64]) -> NDArray[n
 
 
 def matrix(results: Results, study: str) -> Drawing | None:
-    """Probability that a seed of the row's arm beats one of the column's; None with fewer than three arms, or many."""
+    """Probability that a seed of the row beats one of the column; None with fewer than three arms, many, or tasks."""
     arms = compared(results, study)
-    if not 3 <= len(arms) <= MOST:
+    if not 3 <= len(arms) <= MOST or len(results.by_task(study)) > 1:
         return None
     table = np.array([[_beats(results, study, a, b) for b in arms] for a in arms])
     side = 0.52 * len(arms)

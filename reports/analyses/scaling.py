@@ -112,9 +112,9 @@ def _yardsticks(results: Results, found: Sweep) -> dict[str, dict[int, float]]:
 
 
 def _draw(axes: Axes, method: str, values: Mapping[int, Interval], methods: list[str]) -> tuple[float, str, str]:
-    colour, dashes = look(method, methods)
-    at, means = list(values), [x.value for x in values.values()]
-    axes.plot(at, means, color=colour, linestyle=dashes, marker="o", markersize=4, linewidth=1.8, zorder=4)
+    own = look(method, methods)
+    colour, at, means = own.colour, list(values), [x.value for x in values.values()]
+    axes.plot(at, means, linewidth=1.8, zorder=4, **own.marked)
     for n, x in values.items():
         if np.isfinite(x.low):
             axes.plot([n, n], [x.low, x.high], color=colour, linewidth=1.2, alpha=0.6, zorder=3)

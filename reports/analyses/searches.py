@@ -18,7 +18,7 @@ from reports.analyses import settings
 from reports.data.frame import Results
 from reports.data.trials import STATES, params
 from reports.render import figures
-from reports.render.canvas import Drawing, blank, foot, head, look, styled
+from reports.render.canvas import Drawing, Look, blank, foot, head, look, styled
 from reports.render.tables import NONE, Table, describe_task, joined, number, steps, tick
 
 TRIED = ("complete", "pruned", "failed")  # states of a trial that is over
@@ -98,23 +98,22 @@ def fig_trials(results: Results, search: str) -> Drawing | None:
     if not curves:
         return None
     env, arms = _env(results, search), list(tried)
-    entries = {arm: f"{arm} ({_over(trials)})" for arm, trials in tried.items()}
+    entries = {arm: f"{arm} ({_over(trials)})" for arm, trials in tried.items() if trials["state"].isin(TRIED).any()}
     entries = {arm: "\n".join(wrap(text, figures.LEGEND)) for arm, text in entries.items()}
-    columns = min(5, max(1, figures.LEGEND // (max(map(len, entries.values())) + 8)))
-    lines = -(-len(entries) // columns) + sum(entry.count("\n") for entry in entries.values())
-    labels = [_label(arm, curves[arm], look(arm, arms)[0]) for arm in reversed(curves)]
+    columns, lines = figures.legend_size(entries.values())
+    labels = [_label(arm, curves[arm], look(arm, arms).colour) for arm in reversed(curves)]
     tall = max(figures.TALL, figures.LINE * sum(label.lines for label in labels))
     with styled():
         height = figures.HEAD + figures.ROW * lines + tall + figures.FOOT
         figure = blank(figures.WIDTH, height)
         axes = figure.add_axes((figures.LEFT, figures.FOOT / height, figures.SHARE, tall / height))
         for arm in reversed(curves):  # the first arm on top
-            _draw(axes, curves[arm], *look(arm, arms))
+            _draw(axes, curves[arm], look(arm, arms))
         _finish(axes, max(len(trials) for trials in tried.values()), figures.per(results, env.get("kind", "")))
         figures.write_labels(axes, labels, figures.LINE / tall)
         under = f"{describe_task(env)}; {spoken(results, search)}; profile: {results.profile}"
         head(figure, f"Best objective by number of trials, search {search}", under)
-        figures.write_legend(figure, axes, entries, columns, (height - figures.HEAD) / height)
+        figures.write_legend(figure, entries, arms, columns, (height - figures.HEAD) / height)
         foot(
             figure,
             "line: highest mean final return of a complete trial so far; mark: a trial better than all before it"
@@ -135,10 +134,10 @@ def _label(arm: str, rows: pd.DataFrame, colour: str) -> figures.Label:
     return figures.Label(best, text, colour, True)
 
 
-def _draw(axes: Axes, rows: pd.DataFrame, colour: str, dashes: str) -> None:
-    axes.step(rows["trials"], rows["best"], where="post", color=colour, linestyle=dashes, linewidth=1.7, zorder=3)
+def _draw(axes: Axes, rows: pd.DataFrame, look: Look) -> None:
+    axes.step(rows["trials"], rows["best"], where="post", linewidth=1.7, zorder=3, **look.line)
     better = rows[rows["best"].diff().ne(0) & rows["best"].notna()]
-    axes.plot(better["trials"], better["best"], "o", markersize=3.6, color=colour, zorder=4)
+    axes.plot(better["trials"], better["best"], zorder=4, **look.marked | {"linestyle": ""})
 
 
 def _finish(axes: Axes, trials: int, per: str) -> None:

@@ -252,9 +252,23 @@ class Results:
             out.append((json.loads(key), table.sort_values(FINAL) if FINAL in table else table))
         return out
 
+    def by_task(self, study: str) -> list[tuple[dict[str, Any], list[str]]]:
+        """The tasks of a study, each with its arms in their order; how a task is observed does not count."""
+        if study not in self._tasks:
+            found: list[tuple[dict[str, Any], list[str]]] = []
+            for arm, config in self.configs(study).items():
+                env = dict(config.get("env", {}))
+                same = next((arms for task, arms in found if task == env or same_task(task, env)), None)
+                if same is None:
+                    found.append((env, [arm]))
+                else:
+                    same.append(arm)
+            self._tasks[study] = found
+        return self._tasks[study]
+
     def yardsticks_of(self, study: str) -> pd.DataFrame:
-        """Yardsticks on a study's task, however agents observe it; empty if none were run."""
-        return self.yardsticks_on(self.env(study))
+        """Yardsticks on a study's task; empty if none were run, or if its arms do not all have one task."""
+        return self.yardsticks_on(self.env(study)) if len(self.by_task(study)) == 1 else pd.DataFrame()
 
     def yardsticks_on(self, env: Mapping[str, Any]) -> pd.DataFrame:
         """The same for a task's configuration."""
@@ -285,7 +299,7 @@ class Results:
         absent = [arm for arm in expected.get(study, ()) if arm not in arms]
         if absent:
             yield f"Study `{study}`: no such arm yet: {markdown(', '.join(absent))}."
-        if self.yardsticks_of(study).empty:
+        if all(self.yardsticks_on(env).empty for env, _ in self.by_task(study)):
             yield f"Study `{study}`: no yardsticks were run on this task."
 
     def _trainer(self, study: str, name: str) -> int | None:
@@ -299,6 +313,10 @@ class Results:
 
     @cached_property
     def _plans(self) -> dict[tuple[str, str | None], pd.DataFrame]:
+        return {}
+
+    @cached_property
+    def _tasks(self) -> dict[str, list[tuple[dict[str, Any], list[str]]]]:
         return {}
 
     @cached_property

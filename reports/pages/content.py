@@ -12,7 +12,8 @@ from reports.pages.report import Report, definitions, question
 from reports.render.tables import SPAN, Table
 
 DRAWN = "rhmc drawings"
-MORE = ("profile_", "better_", "pairs_", "efficiency_", "steadiness_", "time_", "settings_", "yardsticks")
+PAIRS = "pairs_"  # they carry the answer of a study's own report
+MORE = ("profile_", "better_", PAIRS, "efficiency_", "steadiness_", "time_", "settings_", "yardsticks")
 METHOD, SCALE = "method", "scale"  # parts that are no study's
 
 Part = TypeVar("Part")
@@ -29,6 +30,7 @@ def of(report: Report) -> Mapping[str, Any]:
         "others": others,
         "claims": [page.card(claim) for claim in report.claims],
         "folded": page.FOLDED,
+        "filtered": page.FILTERED,
         "span": SPAN,
         "gaps": [words(gap) for gap in report.gaps],
         "definitions": definitions(results),
@@ -53,7 +55,7 @@ def _head(report: Report) -> dict[str, Any]:
         "profile": report.results.profile,
         "warnings": [words(report.smoke)] if report.smoke else [],
         "notes": [words(report.results.set_aside)] if asked and report.results.set_aside else [],
-        "sentence": "" if asked else answer.sentence(report.claims),
+        "sentence": report.answer if asked else answer.sentence(report.claims),
         "questions": [] if asked else answer.questions(report),
         "open": report.open if asked else 0,
         "rows": [_row(row) for row in forest.rows(report.claims)],
@@ -120,18 +122,15 @@ def _section(report: Report, name: str, title: str, study: str, names: Sequence[
         episodes = [page.episode(task, gif, report.tables_at) for task, gif in results.episodes.items()]
         plates |= {plate.name: plate for plate in episodes}
     grids = {key: page.grid(key, report.tables[key]) for key in names if key in report.tables}
-    return page.Section(name, title, question(results, study) if known else "", *_parted(plates), *_parted(grids))
+    folded = MORE if report.paper else tuple(kind for kind in MORE if kind != PAIRS)
+    parts = *_parted(plates, folded), *_parted(grids, folded)
+    return page.Section(name, title, question(results, study) if known else "", *parts)
 
 
-def _parted(found: Mapping[str, Part]) -> tuple[list[Part], list[Part]]:
-    """The parts that are shown at once, and those that are folded away."""
-    shown = [x for key, x in found.items() if not _folded(key)]
-    return shown, [x for key, x in found.items() if _folded(key)]
-
-
-def _folded(name: str) -> bool:
-    """True if a figure or a table is folded away: what looks at the same runs in yet another way."""
-    return name.startswith(MORE) or name.endswith("_arms")
+def _parted(found: Mapping[str, Part], folded: tuple[str, ...]) -> tuple[list[Part], list[Part]]:
+    """The parts that are shown at once, and those that are folded away: others, which look at the same runs anew."""
+    away = {key for key in found if key.startswith(folded) or key.endswith("_arms")}
+    return [x for key, x in found.items() if key not in away], [x for key, x in found.items() if key in away]
 
 
 def _heading(results: Results, study: str) -> str:

@@ -7,19 +7,21 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import NamedTuple
 
-from reports.analyses import alpha, beyond, comparison, readings, scaling, searches
+from reports.analyses import alpha, beyond, comparison, findings, readings, scaling, searches
 from reports.analyses.scaling import Sweep
 from reports.data.drawn import Counterexample, Scenes
 from reports.data.escaping import stem
 from reports.data.frame import FINAL, Results
 from reports.data.paper import Curves, Paper
 from reports.pages.embed import Embedded
-from reports.render import diagrams, figures, scenes
+from reports.render import diagrams, figures, panels, scenes
 from reports.render.canvas import Drawing
 from reports.render.tables import describe_task, joined, number, steps
 
 PAPERS = "fig_"
 OWN = ("RHMC", "full")  # the paper's method
+HOW = "A band is how far seeds spread; names stand in the order of the final return."
+EACH = 48  # arms that have a frame each
 Made = tuple[str, str, Drawing]  # caption, text for those who cannot see it, figure
 
 
@@ -117,11 +119,14 @@ def search_gallery(results: Results, search: str) -> Iterator[Picture]:
 
 def _trials(results: Results, search: str) -> Made | None:
     drawing = searches.fig_trials(results, search)
+    if drawing is None:
+        return None
     caption = (
+        f"{findings.of_trials(results, search)} "
         "See where each line last rises: an arm that still gains at the right edge may gain from more trials. The "
         "height at a number of trials is what that budget would have found."
     )
-    return (caption, searches.described(results, search), drawing) if drawing else None
+    return caption, searches.described(results, search), drawing
 
 
 def comparisons(results: Results) -> Iterator[Picture]:
@@ -173,6 +178,7 @@ def _by_alpha(results: Results, study: str) -> Iterator[Picture]:
 def _effects(results: Results, study: str) -> Made | None:
     drawing = alpha.fig_effects(results, study)
     caption = (
+        f"{findings.of_effects(results, study)} "
         "Above zero the part helps. See whether the lines on the left rise: then regulation is worth more, the more "
         "Eq. 6 charges; whether a longer horizon adds to that; and whether on the right any interval leaves zero."
     )
@@ -181,62 +187,76 @@ def _effects(results: Results, study: str) -> Made | None:
 
 def _mechanism(results: Results, study: str) -> Made | None:
     drawing = alpha.fig_mechanism(results, study)
+    if drawing is None:
+        return None
     caption = (
+        f"{findings.of_mechanism(drawing.numbers)} "
         "Down a column: what is assigned, what that earned, and what the coordinator learned from. See how far the "
         "regulated reward lies above the earned one while executors still learn, and whether without it, as alpha "
         "grows, ever fewer pairs are assigned."
     )
     columns = joined(f"{x:g}" for x in alpha.mechanism(results, study))
     alt = f"Line charts of assigned pairs, earned and regulated reward against environment steps, for alpha {columns}."
-    return (caption, alt, drawing) if drawing else None
+    return caption, alt, drawing
 
 
 def _assigned(results: Results, study: str) -> Made | None:
     watched = beyond.fig_assignments(results, study)
+    if watched is None:
+        return None
     caption = (
+        f"{findings.of_assigned(watched.numbers)} "
         "The mechanism behind the ablation: see whether pairs grow fewer, whether two agents are sent to one "
         "target ever less often, and whether targets are left to nobody."
     )
     alt = f"Three line charts against environment steps for {joined(beyond.assigning(results, study))}."
-    return (caption, alt, watched) if watched else None
+    return caption, alt, watched
 
 
 def _profile(results: Results, study: str) -> Made | None:
     profile = comparison.profile(results, study)
-    caption = "See which line stays furthest right: that arm's seeds end highest, whatever score one asks for."
-    alt = f"Step chart for {joined(comparison.compared(results, study))}."
-    return (caption, alt, profile) if profile else None
+    if profile is None:
+        return None
+    caption = (
+        f"{findings.of_profile(results, study)} The line furthest right is the arm whose seeds end highest, whatever "
+        "score one asks for; lines that cross are not ordered."
+    )
+    return caption, f"Step chart for {joined(comparison.compared(results, study))}.", profile
 
 
 def _better(results: Results, study: str) -> Made | None:
     matrix, arms = comparison.matrix(results, study), comparison.compared(results, study)
     if matrix is None:
         return None
-    caption = f"Rows are sorted by mean: the bluer the row, the more often it wins. On top: {arms[0]}."
+    caption = (
+        f"{findings.of_matrix(results, study)} Rows are sorted by mean: the bluer the row, the more often it wins."
+    )
     alt = f"Matrix of the probability that a seed of one arm beats one of another, for {joined(arms)}."
     return caption, alt, matrix
 
 
 def _moved(results: Results) -> Made | None:
     moved = beyond.fig_transfer(results)
+    if moved is None:
+        return None
     caption = (
+        f"{findings.of_moved(moved.numbers)} "
         "No step of training with the other numbers: see how far a policy follows the planner as sensors or "
         "targets are added, and where it falls below sensors that each seek their own best window."
     )
-    return (caption, "Two line charts of return against numbers of sensors and of targets.", moved) if moved else None
+    return caption, "Two line charts of return against numbers of sensors and of targets.", moved
 
 
 def curve_caption(results: Results, study: str) -> str:
-    """The result that the curves of a study show, from its numbers."""
-    arms = comparison.compared(results, study)
+    """The result that the curves of a study show, from its numbers, then how they are read."""
     waiting = [arm for arm in results.arms(study) if not len(results.finals(study, arm))]
-    words = f" No finished run yet: {joined(waiting)}." if waiting else ""
-    if not arms:
-        return f"No arm has two finished seeds yet.{words}"
-    means = {arm: float(results.finals(study, arm).mean()) for arm in arms}
-    first = f"{arms[0]} ends highest, at {number(means[arms[0]])}"
-    second = f"; next is {arms[1]} at {number(means[arms[1]])}" if len(arms) > 1 else ""
-    return f"See the order at the right edge: {first}{second}.{_against_scripts(results, study, means)}{words}"
+    listed = (
+        joined(waiting) if len(waiting) <= comparison.MOST else f"{len(waiting)} of {len(results.arms(study))} arms"
+    )
+    words = f" No finished run yet: {listed}." if waiting else ""
+    means = {arm: float(results.finals(study, arm).mean()) for arm in comparison.compared(results, study)}
+    found = findings.of_curves(results, study)
+    return f"{found}{_against_scripts(results, study, means)} {HOW}{words}" if means else f"{found}{words}"
 
 
 def _against_scripts(results: Results, study: str, means: dict[str, float]) -> str:
@@ -252,12 +272,15 @@ def _curves(results: Results, spec: Curves, name: str) -> Iterator[Picture]:
     """All arms in one frame, and where they are many each in a frame of its own."""
 
     def whole() -> Made | None:
-        drawing = figures.learning_curves(results, spec)
+        drawing = panels.panels(results, spec) or figures.learning_curves(results, spec)
         return (curve_caption(results, spec.study), _finals(results, spec.study), drawing) if drawing else None
 
     def each() -> Made | None:
-        drawing = figures.each_arm(results, spec)
-        caption = "The same curves one by one: see the width of each band, and where a curve bends down again."
+        drawing = figures.each_arm(results, spec) if len(results.arms(spec.study)) <= EACH else None
+        caption = (
+            f"{findings.of_spread(results, spec.study)} The same curves one by one: see the width of each band, and "
+        )
+        caption += "where a curve bends down again."
         return (caption, f"Small line charts. {_finals(results, spec.study)}", drawing) if drawing else None
 
     yield from picture(name, spec.title, whole, spec.study)
@@ -353,11 +376,11 @@ def _sweep(results: Results, study: str, name: str) -> Iterator[Picture]:
 
 def _by_agents(results: Results, found: Sweep) -> Made | None:
     drawing = scaling.figure(results, found)
-    caption = (
-        "See whether one line stays on top at every number of agents, and whether it ever falls as they are added."
-    )
+    if drawing is None:
+        return None
+    caption = f"{findings.of_sweep(results, found)} One line is one method; where bars overlap, the order is open."
     alt = f"Line chart of final return against {joined(map(str, found.counts))} agents for {joined(found.arms)}."
-    return (caption, alt, drawing) if drawing else None
+    return caption, alt, drawing
 
 
 def _order(name: str) -> tuple[int, str]:

@@ -13,8 +13,9 @@ from reports.data.stats import Interval, Range
 from reports.pages import sheets
 from reports.pages.answer import sentence
 from reports.pages.gallery import Picture
+from reports.pages.page import LONG
 from reports.pages.report import Report, definitions
-from reports.render.tables import MEASURED, joined, steps
+from reports.render.tables import MEASURED, Table, joined, steps
 
 COMPLETE = "Nothing: every planned run is finished."
 
@@ -28,6 +29,8 @@ def page(report: Report) -> Iterator[str]:
         yield f"{markdown(about)}.\n"
     if report.claims:
         yield f"**{sentence(report.claims)}**\n"
+    if report.answer:
+        yield f"**{markdown(report.answer)}**\n"
     yield "The same with everything in one page: `index.html`.\n"
     for warning in filter(None, (report.smoke, results.set_aside)):
         yield f"**{warning}**\n"
@@ -51,7 +54,7 @@ def page(report: Report) -> Iterator[str]:
             yield f"## {markdown(table.title)}\n"
             if table.note:
                 yield f"{prose(table.note)}\n"
-            yield f"{table.markdown()}\n"
+            yield f"{_body(table)}\n"
             yield f"{_links(table.folder, name, 'CSV', 'LaTeX')}\n"
     yield "## Definitions\n"
     yield "\n".join(f"- **{name}**: {words}" for name, words in definitions(results)) + "\n"
@@ -62,6 +65,13 @@ def page(report: Report) -> Iterator[str]:
     yield f"{report.tables['provenance'].markdown()}\n"
     yield f"Run by run: {_links(MEASURED, 'made', 'CSV', 'LaTeX')}\n"
     yield report.tables["runs"].markdown()
+
+
+def _body(table: Table) -> str:
+    """A table; a long one is folded away."""
+    if len(table.shown) <= LONG:
+        return table.markdown()
+    return f"<details><summary>{len(table.shown)} rows</summary>\n\n{table.markdown()}\n\n</details>"
 
 
 def _figure(picture: Picture) -> Iterator[str]:

@@ -21,6 +21,8 @@ NUMBER = re.compile(r"^[+<\s]*(-?\d[\d,]*(?:\.\d+)?)\s*([kM]?)\b")
 SHOWN = 2 / 3  # of a figure's pixels: all words on the page are then of one size
 LEGIBLE = 0.43  # of a figure's pixels: letters of 9.5 points at 160 dots an inch are then 9 pixels high
 FILES: Mapping[str, str] = {"PDF": "pdf", "numbers": "csv"}
+LONG = 66  # rows of a table that are shown at once: the pairs of twelve arms
+FILTERED = 8  # rows of a table above which it has a field for words; a script makes it
 FOLDED = 6  # quantities of a claim that are shown at once
 EPISODE_WORDS: Mapping[str, str] = {
     "coverage": "Left a trained policy, its lines what its coordinator assigns; then each sensor seeking its own best "
@@ -28,6 +30,7 @@ EPISODE_WORDS: Mapping[str, str] = {
     "navigation": "Left a trained policy; then each agent steering for its nearest landmark; right for the one that a "
     "matching gives it. Green: a landmark with an agent on it.",
 }
+EPISODE_NAMES = "Below each panel stand its policy, the seed that this was trained with, and the number of the episode."
 UNITS = {"": 1.0, "k": 1e3, "M": 1e6}
 MARKS: Mapping[str, str] = {  # a sign for each verdict, beside its colour
     "reproduced": "✓",
@@ -55,6 +58,11 @@ class Grid(NamedTuple):
     columns: list[str]
     rows: list[list[Cell]]
     files: str
+
+    @property
+    def long(self) -> bool:
+        """True if its rows are folded away."""
+        return len(self.rows) > LONG
 
 
 class Plate(NamedTuple):
@@ -122,7 +130,7 @@ def plate(picture: Picture, behind: str) -> Plate:
 
 def episode(task: str, gif: bytes, folder: str) -> Plate:
     """An animation from what `rhmc render` wrote, or its place. folder: of the GIF, which is linked; "" if far away."""
-    words = EPISODE_WORDS.get(task, "A trained policy, and others in the same episode.")
+    words = f"{EPISODE_WORDS.get(task, 'A trained policy, and others in the same episode.')} {EPISODE_NAMES}"
     about = (f"episode_{stem(task)}", f"An episode of {task}", words, words)
     if fault := animation_fault(gif):
         return Plate(*about, "", 0, 0, 0, 0, "rhmc render", [], fault)

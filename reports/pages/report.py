@@ -1,9 +1,9 @@
 """Everything that a report holds, before it is written."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from reports.analyses import readings, scaling, searches
+from reports.analyses import readings, scaling, searches, standing
 from reports.claims import verdicts as rules
 from reports.claims.evidence import READINGS
 from reports.claims.verdicts import ENOUGH, SHORT, Claim
@@ -69,6 +69,7 @@ class Report(NamedTuple):
     smoke: str = ""  # a warning that the runs are too short
     paper: Paper | None = None
     open: int = 0  # gaps in what the claims rest on
+    answer: str = ""  # of a study's own report: where its arms stand
     tables_at: str = ""  # the folder that was read, as the page links it, if it lies beside the page
 
     @property
@@ -116,7 +117,10 @@ def single(results: Results, paper: Paper, study: str) -> Report:
         return Report(results, f"Search {study}, {noted}", lead, pictures, made, gaps, open=len(gaps))
     lead, made = f"{asked} {_lead(results)}", sheets.of_study(results, study) | sheets.last(own)
     pictures, smoke = study_gallery(results, paper, study), rules.smoke_test(own, paper)
-    return Report(results, f"Study {study}, {noted}", lead, pictures, made, gaps, smoke=smoke, open=len(gaps))
+    about: dict[str, Any] = {"smoke": smoke, "open": len(gaps)}
+    if not results.has_readings(study):
+        about["answer"] = standing.sentence(results, study)
+    return Report(results, f"Study {study}, {noted}", lead, pictures, made, gaps, **about)
 
 
 def only(results: Results, studies: Sequence[str]) -> Results:

@@ -14,25 +14,44 @@ from matplotlib.figure import Figure
 from reports.data.escaping import cell
 from reports.render import glyphs
 
-# One colour and line per arm, everywhere. They differ in lightness as well, for colour-blind readers and grey print,
-# and every curve is named at its end.
-LOOKS: Mapping[str, tuple[str, str]] = {
-    "full": ("#0072B2", "-"),
-    "RHMC": ("#0072B2", "-"),
-    "RHMC, team reward": ("#0072B2", "--"),
-    "no regulation": ("#D55E00", "-"),
-    "no filter": ("#009E73", "-"),
-    "HiT-MAC": ("#D55E00", "-"),
-    "QMIX": ("#AA4499", "-"),
-    "VDN": ("#AA4499", "--"),
-    "IQL": ("#111111", "-"),
-    "COMA": ("#B07C00", "-"),
-    "MAPPO": ("#56A0D3", "-"),
-    "IPPO": ("#56A0D3", "--"),
-    "MADDPG": ("#882255", "-."),
+
+class Look(NamedTuple):
+    """The colour of an arm, the dashes of its line and the mark on it."""
+
+    colour: str
+    dashes: str
+    mark: str
+
+    @property
+    def line(self) -> dict[str, Any]:
+        """For matplotlib, without the mark."""
+        return {"color": self.colour, "linestyle": self.dashes}
+
+    @property
+    def marked(self) -> dict[str, Any]:
+        """For matplotlib, with the mark."""
+        return self.line | {"marker": self.mark, "markersize": 5, "markeredgecolor": "white", "markeredgewidth": 0.5}
+
+
+# One look per arm, everywhere. Hues are of Okabe and Ito and of Paul Tol, so chosen that the nearest two methods are
+# as far apart as may be, also without red or without green, and dark enough for words on white. Every curve is named.
+LOOKS: Mapping[str, Look] = {
+    "full": Look("#0072B2", "-", "o"),
+    "RHMC": Look("#0072B2", "-", "o"),
+    "RHMC, team reward": Look("#0072B2", "--", "o"),
+    "no regulation": Look("#D55E00", "-", "s"),
+    "no filter": Look("#117733", "-", "p"),
+    "HiT-MAC": Look("#D55E00", "-", "s"),
+    "QMIX": Look("#EE3377", "-", "^"),
+    "VDN": Look("#332288", "--", "v"),
+    "IQL": Look("#111111", "-", "D"),
+    "COMA": Look("#999933", "-", "P"),
+    "MAPPO": Look("#44AA99", "-", "X"),
+    "IPPO": Look("#117733", "--", "p"),
+    "MADDPG": Look("#882255", "-.", "<"),
 }
-OTHERS = ("#44AA99", "#999933", "#CC6677", "#332288")  # arms with no look of their own, in turn
-DASHES = ("-", "--", ":", "-.")  # by round of those colours
+OTHERS = ("#B07C00", "#AA4499", "#56A0D3", "#8C564B")  # arms with no look of their own, in turn
+ROUNDS = (("-", "h"), ("--", "d"), (":", "8"), ("-.", ">"))  # dashes and mark, by round of those colours
 INK, QUIET, FAINT = "#222222", "#666666", "#B5B5B5"
 BLUE, ORANGE, GREEN, PAPER = "#0072B2", "#D55E00", "#009E73", "#F4F6F8"
 STYLE: dict[str, Any] = {
@@ -114,9 +133,16 @@ def write_csv(table: pd.DataFrame, path: Path, digits: str | None = None) -> Non
     plain.to_csv(path, index=False, float_format=digits, lineterminator="\n", encoding="utf-8")
 
 
-def look(arm: str, arms: Sequence[str]) -> tuple[str, str]:
-    """Colour and line style of an arm among those of its figure."""
-    if arm in LOOKS:
-        return LOOKS[arm]
-    turn = [name for name in arms if name not in LOOKS].index(arm)
-    return OTHERS[turn % len(OTHERS)], DASHES[turn // len(OTHERS) % len(DASHES)]
+def look(arm: str, arms: Sequence[str]) -> Look:
+    """The look of an arm among those of its figure: its own, its method's if no other has that, else one in turn."""
+    if found := _own(arm, arms):
+        return found
+    turn = [name for name in arms if not _own(name, arms)].index(arm)
+    return Look(OTHERS[turn % len(OTHERS)], *ROUNDS[turn // len(OTHERS) % len(ROUNDS)])
+
+
+def _own(arm: str, arms: Sequence[str]) -> Look | None:
+    """Of `RHMC, agents=4` the look of RHMC, if it is the figure's only arm of that method."""
+    method = arm.partition(", ")[0]
+    alone = sum(name.partition(", ")[0] == method for name in arms) == 1
+    return LOOKS.get(arm) or (LOOKS.get(method) if alone else None)

@@ -3,7 +3,7 @@
 Same numbers in, same bytes out: Agg, fixed style, no dates.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from textwrap import wrap
 from typing import Any, NamedTuple
 
@@ -11,17 +11,19 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
 from reports.data.frame import FINAL, Results
 from reports.data.paper import Curves
-from reports.render.canvas import FAINT, MARGIN, QUIET, Drawing, blank, foot, head, look, save, styled
+from reports.render.canvas import FAINT, MARGIN, QUIET, Drawing, Look, blank, foot, head, look, save, styled
 from reports.render.tables import describe_task, joined, number, readable, seeds, spans, steps, tick
 
 __all__ = ["Drawing", "Label", "each_arm", "footer", "learning_curves", "per", "save", "spread"]
-__all__ += ["write_labels", "write_legend"]
+__all__ += ["draw_curve", "held", "legend_size", "mean_curves", "plotted", "write_labels", "write_legend"]
 
 # In inches
 WIDTH, TALL = 9.0, 3.6  # of the figure; least height of the axes
@@ -31,6 +33,10 @@ MANY = 6  # more arms than this get a frame each as well
 COLUMNS = 4  # of those frames
 LEFT, SHARE = 0.075, 0.64  # of the axes, of the figure's width
 RISE = 0.15  # share of the budget in which curves rise
+CROWDED = 0.25  # of the height: where more than three curves end within it, the last part is drawn enlarged as well
+LATE = 0.5  # share of the budget after which that part begins
+SHORT, GAP = 2.5, 0.75  # inches: least height of the axes where there are two, and between them
+MARKS = 7  # on a curve
 
 
 class Label(NamedTuple):
@@ -40,6 +46,7 @@ class Label(NamedTuple):
     text: str
     colour: str
     bold: bool
+    end: float | None = None  # of the line, where that is not y
 
     @property
     def lines(self) -> int:
@@ -54,35 +61,94 @@ def learning_curves(results: Results, spec: Curves) -> Drawing | None:
         None if the study has no points at all.
     """
     arms = results.arms(spec.study)
-    curves = _curves(results, spec.study)
+    curves = mean_curves(results, spec.study)
     if not curves:
         return None
-    yardsticks = _yardsticks(results, spec)
+    yardsticks = yardsticks_in(results, spec)
     levels = {arm: spec.levels[arm] for arm in arms if arm in spec.levels}
-    labels = _yardstick_labels(yardsticks) + _level_labels(levels) + _curve_labels(curves, results, spec.study)
-    entries = ["\n".join(wrap(f"{arm} ({_seed_words(results, spec, arm)})", LEGEND)) for arm in arms]
-    columns = min(5, max(1, LEGEND // (max(map(len, entries)) + 8)))
-    rows = -(-len(arms) // columns) + sum(entry.count("\n") for entry in entries)
-    tall = max(TALL, LINE * sum(label.lines for label in labels))
+    lines = _yardstick_labels(yardsticks) + _level_labels(levels)
+    names, late = _curve_labels(curves, results, spec.study), _late(curves, [*yardsticks.values(), *levels.values()])
+    entries = {arm: "\n".join(wrap(f"{arm} ({_seed_words(results, spec, arm)})", LEGEND)) for arm in curves}
+    columns, rows = legend_size(entries.values())
+    unit = per(results, results.env(spec.study).get("kind", ""))
+    parts = [lines, names + _within(lines, late)] if late else [lines + names]
+    talls = [max(SHORT if late else TALL, LINE * sum(label.lines for label in labels)) for labels in parts]
     with styled():
-        height = HEAD + ROW * rows + tall + FOOT
+        height = HEAD + ROW * rows + sum(talls) + GAP * (len(talls) - 1) + FOOT
         figure = blank(WIDTH, height)
-        axes = figure.add_axes((LEFT, FOOT / height, SHARE, tall / height))
-        _draw_yardsticks(axes, yardsticks)
-        _draw_levels(axes, levels)
-        for arm in reversed(list(curves)):  # the first arm on top
-            _draw_curve(axes, curves[arm], *look(arm, arms))
-        _finish(axes, curves, per(results, results.env(spec.study).get("kind", "")))
-        write_labels(axes, labels, LINE / tall)
-        head(figure, spec.title, describe_task(results.env(spec.study)))
-        write_legend(figure, axes, dict(zip(arms, entries, strict=True)), columns, (height - HEAD) / height)
+        for n, (labels, tall) in enumerate(zip(parts, talls, strict=True)):
+            bottom = FOOT + sum(talls[n + 1 :]) + GAP * (len(talls) - 1 - n)
+            axes = figure.add_axes((LEFT, bottom / height, SHARE, tall / height))
+            _draw_yardsticks(axes, yardsticks)
+            _draw_levels(axes, levels)
+            for place, arm in reversed(list(enumerate(curves))):  # the first arm on top
+                draw_curve(axes, curves[arm], look(arm, arms), place)
+            _finish(axes, curves, unit)
+            if late and n:
+                axes.set_xlim(late.step, axes.get_xlim()[1])
+                axes.set_ylim(late.low, late.high)
+                axes.yaxis.set_major_locator(MaxNLocator(7, steps=[1, 2, 5, 10]))  # no 2.5: its digits take room
+                axes.set_title("the same, enlarged: the part in the box above", fontsize=8.5, loc="left", color=QUIET)
+            elif late:
+                axes.set_xlabel("")
+                _draw_box(axes, late)
+            write_labels(axes, labels, LINE / tall)
+        head(figure, spec.title, _task(results, spec.study))
+        write_legend(figure, entries, arms, columns, (height - HEAD) / height)
         foot(figure, footer(results, spec))
-    return Drawing(figure, _numbers(curves, yardsticks, levels))
+    return Drawing(figure, plotted(curves, yardsticks, levels))
+
+
+class Late(NamedTuple):
+    """The last part of the curves, which is enlarged: from a step on, between two heights."""
+
+    step: float
+    low: float
+    high: float
+
+
+def _late(curves: Mapping[str, pd.DataFrame], lines: Sequence[float]) -> Late | None:
+    """The part to enlarge; None where the curves end far enough from each other. lines: other heights of the axes."""
+    last = max(float(rows["step"].max()) for rows in curves.values())
+    late = [rows[rows["step"] >= LATE * last] for rows in curves.values()]
+    ends = [float(rows["mean"].iloc[-1]) for rows in late if len(rows)]
+    heights = [y for rows in curves.values() for y in (rows["mean"].min(), rows["mean"].max())] + list(lines)
+    if len(ends) <= 3 or np.ptp(ends) > CROWDED * (max(heights) - min(heights)):
+        return None
+    values = pd.concat([rows["mean"] for rows in late])
+    margin = 0.1 * float(np.ptp(values)) or 1.0
+    return Late(LATE * last, float(values.min()) - margin, float(values.max()) + margin)
+
+
+def _within(labels: Sequence[Label], late: Late | None) -> list[Label]:
+    """The lines that are seen in the enlarged part as well."""
+    return [label for label in labels if late and late.low < label.y < late.high]
+
+
+def _draw_box(axes: Axes, late: Late) -> None:
+    """Around the part that is enlarged."""
+    width, height = axes.get_xlim()[1] - late.step, late.high - late.low
+    axes.add_patch(
+        Rectangle((late.step, late.low), width, height, fill=False, edgecolor=QUIET, linewidth=0.9, zorder=6)
+    )
+
+
+def _task(results: Results, study: str) -> str:
+    """The task of all arms, or how many they have."""
+    found = results.by_task(study)
+    return describe_task(found[0][0]) if len(found) == 1 else f"{len(found)} tasks, so no yardstick is common to all"
+
+
+def legend_size(entries: Iterable[str]) -> tuple[int, int]:
+    """Columns and rows of a legend."""
+    entries = list(entries)
+    columns = min(5, max(1, LEGEND // (max(map(len, entries)) + 8)))
+    return columns, -(-len(entries) // columns) + sum(entry.count("\n") for entry in entries)
 
 
 def each_arm(results: Results, spec: Curves) -> Drawing | None:
     """A small frame for every arm, the others faint behind it. None with `MANY` arms or fewer."""
-    curves = _curves(results, spec.study)
+    curves = mean_curves(results, spec.study)
     if len(curves) <= MANY:
         return None
     rows = -(-len(curves) // COLUMNS)
@@ -103,14 +169,14 @@ def each_arm(results: Results, spec: Curves) -> Drawing | None:
             for other, points in curves.items():
                 if other != arm:
                     axes.plot(points["step"], points["mean"], color="#D5D5D5", linewidth=0.8, zorder=2)
-            _draw_curve(axes, curves[arm], look(arm, list(curves))[0], "-")
+            draw_curve(axes, curves[arm], look(arm, results.arms(spec.study))._replace(dashes="-"))
             _name_frame(axes, arm, results.finals(spec.study, arm))
-            axes.set_ylim(*_held(curves))
+            axes.set_ylim(*held(curves))
         foot(figure, footer(results, spec, levels=False))
-    return Drawing(figure, _numbers(curves, {}, {}))
+    return Drawing(figure, plotted(curves, {}, {}))
 
 
-def _held(curves: Mapping[str, pd.DataFrame]) -> tuple[float, float]:
+def held(curves: Mapping[str, pd.DataFrame]) -> tuple[float, float]:
     """Heights between which all means are once `RISE` of the budget is spent, with a margin."""
     last = max(float(rows["step"].max()) for rows in curves.values())
     late = [rows.loc[rows["step"] >= RISE * last, "mean"] for rows in curves.values()]
@@ -153,24 +219,24 @@ def footer(results: Results, spec: Curves, *, levels: bool = True) -> str:
     budget = results.budget(spec.study)
     first = f"profile: {results.profile}, {steps(budget) if budget else 'unknown'} steps, "
     first += f"{'–'.join(map(str, counts))} {'seed' if counts == [1] else 'seeds'}"
-    band = spans(n for rows in _curves(results, spec.study).values() for n in rows["n"])
+    band = spans(n for rows in mean_curves(results, spec.study).values() for n in rows["n"])
     lines = f"lines: mean over seeds of greedy evaluation; band: {band}"
     names = ["names: final return"]
     names += (
         ["dotted: the paper's values"] if levels and any(arm in spec.levels for arm in results.arms(spec.study)) else []
     )
     names += (
-        ["grey: yardsticks (policies without learning, and bounds)"] if levels and _yardsticks(results, spec) else []
+        ["grey: yardsticks (policies without learning, and bounds)"] if levels and yardsticks_in(results, spec) else []
     )
     return f"{first}  ·  code {prints}\n{lines}\n{'; '.join(names)}"
 
 
-def _curves(results: Results, study: str) -> dict[str, pd.DataFrame]:
+def mean_curves(results: Results, study: str) -> dict[str, pd.DataFrame]:
     """The mean curves of the arms that have points."""
     return {arm: rows for arm in results.arms(study) if len(rows := results.mean_curve(study, arm))}
 
 
-def _yardsticks(results: Results, spec: Curves) -> dict[str, float]:
+def yardsticks_in(results: Results, spec: Curves) -> dict[str, float]:
     table = results.yardsticks_of(spec.study)
     if FINAL not in table:
         return {}
@@ -196,8 +262,9 @@ def _curve_labels(curves: Mapping[str, pd.DataFrame], results: Results, study: s
         finals = results.finals(study, arm)
         words = f"{arm} {number(float(finals.mean()))}" if len(finals) else f"{arm}, unfinished"
         text = "\n".join(wrap(words, LETTERS, break_on_hyphens=False))
-        end = float(finals.mean()) if len(finals) else float(rows["mean"].iloc[-1])  # sorted as the words say
-        labels.append(Label(end, text, look(arm, results.arms(study))[0], True))
+        end = float(rows["mean"].iloc[-1])
+        height = float(finals.mean()) if len(finals) else end  # sorted as the words say
+        labels.append(Label(height, text, look(arm, results.arms(study)).colour, True, end))
     return labels
 
 
@@ -206,7 +273,7 @@ def _by_level(levels: Mapping[str, float]) -> dict[float, list[str]]:
 
 
 def _level_colour(arms: Sequence[str]) -> str:
-    return look(arms[0], arms)[0] if len(arms) == 1 else QUIET
+    return look(arms[0], arms).colour if len(arms) == 1 else QUIET
 
 
 def _draw_yardsticks(axes: Axes, yardsticks: Mapping[str, float]) -> None:
@@ -219,9 +286,12 @@ def _draw_levels(axes: Axes, levels: Mapping[str, float]) -> None:
         axes.axhline(y, color=_level_colour(arms), linewidth=1.4, linestyle=":", zorder=2)
 
 
-def _draw_curve(axes: Axes, rows: pd.DataFrame, colour: str, dashes: str) -> None:
-    whole = rows["n"] == rows["n"].max()  # where every seed that has begun still is
-    axes.plot(rows["step"][whole], rows["mean"][whole], color=colour, linestyle=dashes, linewidth=1.9, zorder=4)
+def draw_curve(axes: Axes, rows: pd.DataFrame, own: Look, place: int | None = None) -> None:
+    """A mean curve with its band. place: of the arm in its figure, which keeps marks apart; None for no marks."""
+    colour, whole = own.colour, rows["n"] == rows["n"].max()  # where every seed that has begun still is
+    every = max(1, int(whole.sum()) // MARKS)
+    how = own.line if place is None else own.marked | {"markevery": (place % every, every)}
+    axes.plot(rows["step"][whole], rows["mean"][whole], linewidth=1.7, zorder=4, **how)
     rest = rows[~whole | whole.shift(-1, fill_value=True).eq(False)]
     if not whole.all():
         axes.plot(rest["step"], rest["mean"], color=colour, linewidth=1.4, alpha=0.45, zorder=4)
@@ -259,8 +329,11 @@ def write_labels(axes: Axes, labels: Sequence[Label], line: float) -> None:
     """Names to the right of the axes, each joined to its line. line: height of a line of words, in the axes'."""
     low, high = axes.get_ylim()
     heights = [(label.y - low) / (high - low) for label in labels]
+    ends = [
+        y if label.end is None else (label.end - low) / (high - low) for label, y in zip(labels, heights, strict=True)
+    ]
     sizes = [line * label.lines for label in labels]
-    for label, y, place in zip(labels, heights, spread(heights, sizes, 0.0, 1.0), strict=True):
+    for label, y, place in zip(labels, ends, spread(heights, sizes, 0.0, 1.0), strict=True):
         joint: dict[str, Any] = {"color": label.colour, "linewidth": 0.8, "alpha": 0.7, "clip_on": False}
         axes.plot([1.0, 1.02, 1.03], [y, place, place], transform=axes.transAxes, **joint)
         weight = "bold" if label.bold else "normal"
@@ -268,12 +341,9 @@ def write_labels(axes: Axes, labels: Sequence[Label], line: float) -> None:
         axes.text(1.037, place, label.text, color=label.colour, fontweight=weight, **at)
 
 
-def write_legend(figure: Figure, axes: Axes, entries: Mapping[str, str], columns: int, top: float) -> None:
-    """Above the axes: every planned arm with its number of seeds."""
-    lines = []
-    for arm in entries:
-        colour, dashes = look(arm, list(entries))
-        lines += axes.plot([], [], color=colour, linestyle=dashes, linewidth=1.9)
+def write_legend(figure: Figure, entries: Mapping[str, str], arms: Sequence[str], columns: int, top: float) -> None:
+    """Above the axes: every arm that is drawn, with its number of seeds. arms: all that looks are shared out among."""
+    lines = [Line2D([], [], linewidth=1.7, **look(arm, arms).marked) for arm in entries]
     how: dict[str, Any] = {"handlelength": 2.4, "columnspacing": 1.6, "borderpad": 0.0, "borderaxespad": 0.0}
     how |= {"loc": "upper left", "bbox_to_anchor": (MARGIN, top + 0.01), "frameon": False, "fontsize": 8.5}
     figure.legend(lines, list(entries.values()), ncols=columns, **how)  # named here: of itself it leaves out `_c`
@@ -284,7 +354,7 @@ def _seed_words(results: Results, spec: Curves, arm: str) -> str:
     return f"{found} {'seed' if found == '1' else 'seeds'}"
 
 
-def _numbers(
+def plotted(
     curves: Mapping[str, pd.DataFrame], yardsticks: Mapping[str, float], levels: Mapping[str, float]
 ) -> pd.DataFrame:
     parts = [

@@ -31,6 +31,17 @@ click("table-final_ablation", 1);
 found.down = column("table-final_ablation", 1);
 click("table-final_reach", 1);
 found.reach = column("table-final_reach", 1);
+const field = document.querySelector("#table-runs").parentElement.previousElementSibling.querySelector("input");
+const seen = () => [...document.querySelectorAll("#table-runs tbody tr")].filter((row) => !row.hidden);
+const type = (text) => { field.value = text; field.dispatchEvent(new Event("input")); };
+found.rows_of = {all: seen().length};
+type("REGULATION  finished");
+found.rows_of.some = seen().length;
+found.rows_of.right = seen().every((row) => row.textContent.includes("no regulation"));
+found.rows_of.said = document.getElementById("said").textContent;
+type("");
+found.rows_of.again = seen().length;
+found.fields = document.querySelectorAll("input").length;
 const links = [...document.querySelectorAll("a[href]")].map((link) => link.getAttribute("href"));
 found.lost = links.filter((href) => href.startsWith("#") && !document.getElementById(href.slice(1)));
 found.files = links.filter((href) => !href.startsWith("#"));
@@ -91,6 +102,10 @@ def test_it_opens_sorts_and_leads_on(made: Path, tmp_path: Path) -> None:
     assert found["state"] == [None, "ascending", None, None, None]
     assert found["said"].startswith("Final results of study ablation sorted by Final return")
     assert found["reach"] == ["63.0 (62.0 to 64.0)", "68.0"]
+    rows = found["rows_of"]
+    assert (rows["some"], rows["right"], rows["again"]) == (3, True, rows["all"])
+    assert rows["said"] == f"3 of {rows['all']} rows"
+    assert 1 <= found["fields"] < 5  # long tables alone
     assert found["lost"] == []
     assert len(found["files"]) > 20
     assert [name for name in found["files"] if not (made / name).exists()] == []

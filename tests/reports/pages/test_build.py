@@ -258,8 +258,9 @@ def texts_of(drawing: figures.Drawing) -> list[Text]:
 
 def overlaps(drawing: figures.Drawing) -> list[tuple[str, str]]:
     """Pairs of words that lie on each other."""
-    axes = drawing.figure.axes[0]
-    ticks = [*axes.get_xticklabels(), *axes.get_yticklabels()]  # some lie outside the axes and are not drawn
+    ticks = [  # some lie outside the axes and are not drawn
+        tick for axes in drawing.figure.axes for tick in (*axes.get_xticklabels(), *axes.get_yticklabels())
+    ]
     found = [text for text in texts_of(drawing) if text.get_visible() and text.get_text() and text not in ticks]
     boxes = [(text.get_text(), text.get_window_extent()) for text in found]
     return [(a, b) for n, (a, box) in enumerate(boxes) for b, other in boxes[:n] if box.overlaps(other)]

@@ -150,6 +150,8 @@ def test_an_animation_leads_to_its_gif_where_that_is_beside_the_page(tmp_path: P
         build(runs, out, "quick")
         links = {link["href"] for link in Reader((out / "index.html").read_text()).of("a")}
         assert ("runs/episode_coverage.gif" in links) is linked
+        words = Reader((out / "index.html").read_text()).text
+        assert "the seed that this was trained with, and the number of the episode" in words
 
 
 @pytest.mark.usefixtures("unpainted", "quick_resampling")
@@ -215,6 +217,34 @@ def test_one_study(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "The paper's claims" not in text
     assert write_report(runs, out, study="raech") == "refused"
     assert "no table of study 'raech' here (there are other, reach)" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("unpainted")
+def test_a_study_answers_first_and_shows_its_pairs(tmp_path: Path) -> None:
+    arms = {"one": noisy(67, 5, 0.1), "two": noisy(63, 5, 0.1), "three": noisy(50, 5, 0.1)}
+    build(write(tmp_path / "runs", study("reach", arms, points=3)), tmp_path / "out", "quick", "reach")
+    said = "one ends highest, at 67.0, clearly better than two and three (by 4.0 to 17.0)."
+    page_, index = ((tmp_path / "out" / name).read_text() for name in ("index.html", "index.md"))
+    assert page_.index(f'<p class="answer">{said}</p>') < page_.index("planned runs finished")
+    assert index.splitlines()[2] == f"**{said}**"
+    assert page_.index('id="table-pairs_reach"') < page_.index('<details class="more">')
+    build(tmp_path / "runs", tmp_path / "all", "quick")
+    whole = (tmp_path / "all" / "index.html").read_text()
+    assert whole.index('<details class="more">') < whole.index('id="table-pairs_reach"')
+
+
+@pytest.mark.usefixtures("unpainted")
+def test_hundreds_of_pairs_are_folded_and_the_clear_ones_come_first(tmp_path: Path) -> None:
+    arms = {f"arm {n:02}": noisy(50 + n / 5, 5, 0.4) for n in range(13)}
+    build(write(tmp_path / "runs", study("reach", arms, points=2)), tmp_path / "out", "quick", "reach")
+    text = (tmp_path / "out" / "index.html").read_text()
+    assert "<details><summary>Pairs of arms, study reach: 78 rows</summary>" in text
+    Reader(text)
+    clear = (tmp_path / "out" / "tables" / "pairs_reach.md").read_text().splitlines()[2:]
+    cells = [line.split(" | ")[6] for line in clear]
+    assert cells == sorted(cells, reverse=True)
+    assert set(cells) == {"yes", "no"}
+    assert "<details><summary>78 rows</summary>" in (tmp_path / "out" / "index.md").read_text()
 
 
 @pytest.mark.usefixtures("unpainted")
