@@ -165,10 +165,9 @@ class MlflowTracker:
         return ref
 
     def _describe(self, ref: str, note: str) -> None:
-        """Show the note, with the saved views in its first paragraph: all that MLflow shows of it unasked."""
+        """Show the note behind the saved views: MLflow shows its first line unasked, as far as the window is wide."""
         assert self.experiment is not None
-        first, gap, rest = note.partition("\n\n")
-        note = fitting(f"{first} {saved_views.links(self.experiment)}{gap}{rest}")
+        note = fitting(f"{saved_views.links(self.experiment)} · {note}")
         self.client.set_experiment_tag(self.experiment, NOTE, note)
         self.client.set_tag(ref, NOTE, note)
 
