@@ -354,7 +354,7 @@ def _entry(about: Manifest, at: int, run: Run, values: Values) -> Entry:
     _check_params(where, run.params, spec)
     card = Card(
         run.arm, spec.seed, spec.id, code, spec.algo.kind, spec.env.kind, run.commit, run.params,
-        modules=about.code.get(code, {}), imported=_origin(run, values),
+        modules=about.code.get(code, {}), imported=_origin(run, values), env=spec.env.model_dump(mode="json"),
     )  # fmt: skip
     entry = Entry(Item(card, spec, about.study), run.finished, run.policy, values, run.key)
     _check_curve(where, entry)

@@ -42,8 +42,9 @@ def ui(port: Annotated[int, typer.Option(min=1, max=65535, help="Where to listen
 
     home.prepare()
     store = prepared(home)
-    saved = addresses(store, f"http://{HOST}:{port}")
     _free(port)
+    tell("starting MLflow; its address follows")
+    saved = addresses(store, f"http://{HOST}:{port}")
     # MLflow makes the folders of a SQLite address as it is written, with %20 for a space; a bare name has none.
     _serve(uri or f"sqlite:///{home.database.name}", home.artifacts, port, saved)
 
@@ -75,6 +76,7 @@ def _serve(uri: str, artifacts: Path, port: int, saved: Iterable[tuple[str, str,
         "MLFLOW_BACKEND_STORE_URI": uri,
         "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false",
         "MLFLOW_DISABLE_TELEMETRY": "true",
+        "MLFLOW_ENABLE_AI_GATEWAY": "false",  # of no use here, and a place in the menu
         "DO_NOT_TRACK": "true",
         "PYTHONSAFEPATH": "1",  # no module of the work folder is taken for one of Python's
     }
@@ -133,12 +135,12 @@ def _answers(server: "subprocess.Popen[bytes]", port: int) -> bool:
 
 
 def _tell(port: int, saved: Iterable[tuple[str, str, str]]) -> None:
-    """The addresses: all experiments, and the views of each."""
+    """The addresses: all experiments, and the first view of each, which leads to the others."""
     say(f"http://{HOST}:{port}/#/experiments?workflowType=machine_learning  (Ctrl-C ends it)")
-    for experiment, views in groupby(saved, key=lambda one: one[0]):
-        say(f"\n{experiment}")
-        for _, view, address in views:
-            say(f"  {view + ':':15} {address}")
+    first = {experiment: next(views)[2] for experiment, views in groupby(saved, key=lambda one: one[0])}
+    width = max(map(len, first), default=0)
+    for experiment, address in first.items():
+        say(f"{experiment:{width}}  {address}")
 
 
 def _end(server: "subprocess.Popen[bytes]") -> None:

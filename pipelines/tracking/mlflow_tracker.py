@@ -3,6 +3,7 @@
 One experiment per study and profile, in it one parent run for the study and one nested run per arm and key.
 """
 
+import hashlib
 import json
 import logging
 import os
@@ -41,7 +42,7 @@ os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")  # the l
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "4")  # 28 s: a server that was killed is back by then
 
 from mlflow import MlflowClient
-from mlflow.entities import Experiment, Metric, Param, Run, RunTag, ViewType
+from mlflow.entities import Dataset, DatasetInput, Experiment, Metric, Param, Run, RunTag, ViewType
 from mlflow.exceptions import MlflowException
 from mlflow.store.artifact.artifact_repo import ArtifactRepository
 from mlflow.store.artifact.artifact_repository_registry import get_artifact_repository
@@ -165,10 +166,9 @@ class MlflowTracker:
         return ref
 
     def _describe(self, ref: str, note: str) -> None:
-        """Show the note, with the saved views in its first paragraph: all that MLflow shows of it unasked."""
+        """Show the note behind the saved views: MLflow shows its first line unasked, as far as the window is wide."""
         assert self.experiment is not None
-        first, gap, rest = note.partition("\n\n")
-        note = fitting(f"{first} {saved_views.links(self.experiment)}{gap}{rest}")
+        note = fitting(f"{saved_views.links(self.experiment)} · {note}")
         self.client.set_experiment_tag(self.experiment, NOTE, note)
         self.client.set_tag(ref, NOTE, note)
 
@@ -277,6 +277,9 @@ class MlflowTracker:
             new = [Param(name, value) for name, value in card.params.items() if name not in run.data.params]
             if new:  # a new run, or one whose driver was killed between making it and this
                 self.client.log_batch(ref, params=new)
+            if card.env and not (run.inputs and run.inputs.dataset_inputs):
+                with decoration(f"{card.name}: its task in the log", _note):
+                    self.client.log_inputs(ref, [DatasetInput(task_of(card), [])])
             seen = {(row.metric, row.step) for row in self.rows([ref])} if run.data.metrics else set()
         return MlflowRun(self, card, ref, seen)
 
@@ -450,6 +453,13 @@ class MlflowRun:
         if folder and folder.is_dir():
             for path in (*folder.rglob("*"), folder, *list(folder.parents)[:3]):
                 sync(path)
+
+
+def task_of(card: Card) -> Dataset:
+    """The task of a run, in the place that MLflow has for data: its settings stand for the episodes that it makes."""
+    settings = json.dumps(dict(card.env), sort_keys=True)
+    digest = hashlib.sha256(settings.encode()).hexdigest()[:8]
+    return Dataset(card.task, digest, "code", json.dumps({"tags": dict(card.env)}, sort_keys=True), profile=settings)
 
 
 def _note(text: str) -> None:

@@ -57,7 +57,8 @@ def items(study: Study, commit: str = "", where: Host | None = None) -> list[Ite
         params |= {"seed": str(spec.seed)}
         code = modules(algorithm, task)
         names = (run.arm, spec.seed, spec.id, combined(code.values()), algorithm, task, commit)
-        card = Card(*names, params, host=where or Host(), modules=code)
+        env = spec.env.model_dump(mode="json")
+        card = Card(*names, params, host=where or Host(), modules=code, env=env)
         planned.append(Item(card, spec, study.name))
     return planned
 

@@ -44,6 +44,7 @@ class Card(NamedTuple):
     host: Host = Host()  # that starts it
     modules: Mapping[str, str] = MappingProxyType({})  # digests of the code that decides it
     imported: str = ""  # names what a bundle has of it, should it come from one
+    env: Mapping[str, object] = MappingProxyType({})  # all settings of the task, where they are known
 
     @property
     def key(self) -> str:

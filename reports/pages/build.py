@@ -17,6 +17,7 @@ from reports.data.frame import TableError, load
 from reports.data.paper import PaperError, read
 from reports.pages import content, embed, index, page
 from reports.pages.gallery import Picture, reason
+from reports.pages.metrics import metrics
 from reports.pages.report import Report, single, whole
 from reports.render.canvas import save, write_csv
 from reports.render.glyphs import LOST
@@ -26,7 +27,8 @@ from reports.render.vector import svg
 Outcome = Literal["whole", "undrawn", "refused"]  # of a report
 PART = ".report-"  # begins the name of the folder in which a report is made
 RUNS = "runs"  # the folder of the tables beside the page
-MADE = ("figures", TABLES, MEASURED, "claims.md", "claims.csv", "claims.json", "index.md", "index.html")
+METRICS = "metrics.json"
+MADE = ("figures", TABLES, MEASURED, "claims.md", "claims.csv", "claims.json", METRICS, "index.md", "index.html")
 
 
 class OutError(ValueError):
@@ -131,6 +133,7 @@ def _write(report: Report, folder: Path) -> Report:
         _save(table, folder / table.folder, name)
     if report.claims:
         _write_claims(report.claims, folder)
+        _write_text(folder / METRICS, json.dumps(metrics(report), indent=1, ensure_ascii=False) + "\n")
     report = report._replace(pictures=[_saved(picture, pictures) for picture in report.pictures])
     _write_text(folder / "index.md", "\n".join(index.page(report)) + "\n")
     _write_text(folder / "index.html", page.render(content.of(report)))

@@ -841,11 +841,13 @@ def test_ui_serves_the_store_on_this_machine_only_until_ctrl_c(
 
     monkeypatch.setattr("urllib.request.urlopen", answer)
     monkeypatch.setattr(
-        "pipelines.tracking.mlflow_tracker.addresses", lambda *given: [("a", "One", "x"), ("a", "Two", "y")]
+        "pipelines.tracking.mlflow_tracker.addresses",
+        lambda *given: [("a", "One", "x"), ("a", "Two", "y"), ("bcd", "One", "z")],
     )
     said = rhmc("ui", "--port", str(port))
     assert list(asked) == []  # it waited for the server
-    assert said.out.endswith(" ends it)\n\na\n  One:            x\n  Two:            y\n")
+    assert said.out.endswith(" ends it)\na    x\nbcd  z\n")  # a line for each study
+    assert said.err == "starting MLflow; its address follows\n"
     assert killed == [(Server.pid, signal.SIGTERM)]
     command, env = Server.given
     assert said.code == 0
@@ -858,7 +860,7 @@ def test_ui_serves_the_store_on_this_machine_only_until_ctrl_c(
     wait_for(lambda: log.read_text() == "talk of http://me:***@host\n\ufffd\n", "ui.log")
     assert (options["--host"], options["--port"], options["--workers"]) == ("127.0.0.1", str(port), "1")
     assert env["MLFLOW_SERVER_ENABLE_JOB_EXECUTION"] == "false"
-    assert env["MLFLOW_DISABLE_TELEMETRY"] == "true"
+    assert (env["MLFLOW_DISABLE_TELEMETRY"], env["MLFLOW_ENABLE_AI_GATEWAY"]) == ("true", "false")
 
 
 def test_ui_tells_no_address_of_a_server_that_ended_at_once(
@@ -870,7 +872,7 @@ def test_ui_tells_no_address_of_a_server_that_ended_at_once(
     monkeypatch.setattr(ui, "_free", lambda port: None)
     monkeypatch.setattr(ui.signal, "signal", lambda *given: None)
     why = f"rhmc: MLflow's server ended with exit code 3; {store.parent}/ui.log says why\n"
-    assert rhmc("ui") == (1, "", why)
+    assert rhmc("ui") == (1, "", f"starting MLflow; its address follows\n{why}")
 
 
 def test_sigterm_ends_the_server_and_its_workers(tmp_path: Path) -> None:

@@ -2,7 +2,9 @@
 
 import importlib
 import inspect
+import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -25,7 +27,8 @@ from tests.memory_tracker import MemoryTracker
 from tests.pipelines.support import run_rhmc, setting, tiny
 
 ROOT = Path(__file__).parents[3]
-STAGES: dict[str, Any] = YAML(typ="safe").load((ROOT / "dvc.yaml").read_text(encoding="utf-8"))["stages"]
+PIPELINE: dict[str, Any] = YAML(typ="safe").load((ROOT / "dvc.yaml").read_text(encoding="utf-8"))
+STAGES: dict[str, Any] = PIPELINE["stages"]
 HOME = "results/${profile}/"
 PAGE = {"index.html", "index.md", "measured"}  # of the report, and no out
 
@@ -111,6 +114,28 @@ def test_the_pipeline_names_what_the_report_reads_and_writes() -> None:
     assert deps("report") == set().union(*(outs(name) for name in STAGES if name != "report"))
     every = set().union(*map(outs, STAGES), *map(deps, STAGES))
     assert {name for name in every if name.endswith(".made.parquet") or name == "runs"} == set()
+
+
+def test_what_dvc_plots_is_drawn_by_the_report() -> None:
+    """The template names the columns of the figures' tables; the paper profile's are in git."""
+    template = (ROOT / ".dvc" / "plots" / "curves.json").read_text(encoding="utf-8")
+    fields = set(re.findall(r'"field": "(\w+)"', template)) - {"rev"}
+    for plot in PIPELINE["plots"]:
+        (about,) = plot.values()
+        ((table, value),) = about["y"].items()
+        assert about["template"] == "curves"
+        columns = (ROOT / table.replace("${profile}", "paper")).read_text(encoding="utf-8").partition("\n")[0]
+        assert fields | {"kind", about["x"], value} <= set(columns.split(","))
+    assert json.loads(template)["transform"] == [{"filter": "datum.kind == 'curve'"}]
+
+
+def test_dvc_compares_what_the_report_says() -> None:
+    """At a place that is the same for every profile, and in git: else `dvc exp show` has nothing to compare."""
+    assert PIPELINE["metrics"] == [next(iter(out)) for out in STAGES["metrics"]["outs"]]
+    assert STAGES["metrics"]["deps"] == [f"{HOME}{build.METRICS}"]
+    for name in PIPELINE["metrics"]:
+        ignored = subprocess.run(["git", "check-ignore", "-q", name], cwd=ROOT, check=False).returncode
+        assert ignored == 1
 
 
 def test_no_other_table_has_room_for_how_it_was_made() -> None:
@@ -204,7 +229,10 @@ def test_dvc_says_all_but_its_hint(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout, done.stderr) == (3, "one ['repro', '--dry']\n", "")
 
 
-@pytest.mark.parametrize(("name", "said"), [("report", f"stage {len(STAGES)} of {len(STAGES)}: report\n"), ("x", "")])
+LAST = list(STAGES)[-1]
+
+
+@pytest.mark.parametrize(("name", "said"), [(LAST, f"stage {len(STAGES)} of {len(STAGES)}: {LAST}\n"), ("x", "")])
 def test_a_stage_says_which_it_is(
     name: str, said: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,5 +1,6 @@
 """Both logs, MLflow's and the twin in memory, against what the protocol promises; then what is MLflow's alone."""
 
+import json
 import math
 import shutil
 import socket
@@ -11,6 +12,8 @@ from pathlib import Path
 
 import pytest
 from mlflow import MlflowClient
+from mlflow.data import get_source
+from mlflow.entities import DatasetInput
 
 from pipelines.specs.safe_names import shown
 from pipelines.tracking import histories, mlflow_tracker
@@ -53,6 +56,38 @@ def logged_steps(tracker: Tracker, ref: str, metric: str) -> list[int]:
     if isinstance(tracker, MlflowTracker):
         return sorted(value.step for value in tracker.client.get_metric_history(ref, shown(metric)))
     return [row.step for row in tracker.rows([ref]) if row.metric == metric]
+
+
+def test_the_task_of_a_run_is_its_dataset(home: Path) -> None:
+    tracker = MlflowTracker(STUDY, Home(home))
+    card = CARD._replace(env={"kind": "coverage", "agents": 4})
+
+    def logged(card: Card) -> list[DatasetInput]:
+        return tracker.client.get_run(tracker.start(card).ref).inputs.dataset_inputs
+
+    (first,) = logged(card)
+    assert (first.dataset.name, json.loads(first.dataset.profile or "")) == ("coverage", card.env)
+    source = get_source(first)  # MLflow's own reader
+    assert json.loads(source.to_json())["tags"] == card.env
+    assert [one.dataset.digest for one in logged(card)] == [first.dataset.digest]  # continued: no second one
+    (same,) = logged(card._replace(seed=4, spec_id="seed"))
+    (other,) = logged(card._replace(spec_id="other", env={"kind": "coverage", "agents": 5}))
+    assert same.dataset.digest == first.dataset.digest != other.dataset.digest
+    assert logged(CARD._replace(spec_id="unknown")) == []
+
+
+def test_a_launch_goes_on_without_it(
+    home: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    tracker = MlflowTracker(STUDY, Home(home))
+
+    def refuse(*given: object) -> None:
+        raise OSError("no room")
+
+    monkeypatch.setattr(tracker.client, "log_inputs", refuse)
+    tracker.start(CARD._replace(env={"kind": "coverage"})).finish("finished")
+    assert [run.status for run in tracker.recorded()] == ["finished"]
+    assert "full s3: its task in the log: left out (OSError: no room)" in capfd.readouterr().err
 
 
 def test_what_is_logged_can_be_read(opened: Open) -> None:
@@ -185,8 +220,10 @@ def test_how_a_run_looks_in_mlflow(home: Path) -> None:
     assert "machine" not in run.data.tags  # not known: no empty word
     tracker.start(CARD._replace(spec_id="other", host=Host("a machine", "torch 2"))).finish("finished")
     assert {run.key: run.host for run in tracker.recorded()}["other-c0de"] == ("a machine", "torch 2")
-    assert parent.data.tags["mlflow.note.content"].startswith("**Why?** [Curves by arm](#/experiments/")
-    assert tracker.client.get_experiment(run.info.experiment_id).tags["mlflow.note.content"].startswith("**Why?** [")
+    note = parent.data.tags["mlflow.note.content"]
+    assert note.startswith("[Curves by arm](#/experiments/")
+    assert ") · **Why?**" in note
+    assert tracker.client.get_experiment(run.info.experiment_id).tags["mlflow.note.content"] == note
     assert tracker.file(log.ref, "none.pt", home) is None
     (home / "copy").mkdir()
     kept = tracker.file(log.ref, "policy.pt", home / "copy")

@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import subprocess
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.text import Text
 
+from reports.claims.evidence import VERDICTS
 from reports.data.frame import TableError, load
 from reports.data.paper import read
 from reports.pages import build as report
@@ -113,6 +115,20 @@ def test_index(made: Path) -> None:
     assert "mean over seeds of final/return" in text
     linked = [part.split(")")[0] for part in text.split("](")[1:]]
     assert [link for link in linked if not link.startswith("#") and not (made / link).exists()] == []
+
+
+def test_the_few_numbers_that_reports_are_compared_by(made: Path, runs: Path) -> None:
+    found, claims = (json.loads((made / name).read_text()) for name in ("metrics.json", "claims.json"))
+    counts = Counter(claim["verdict"] for claim in claims)
+    assert found["verdicts"] == {verdict: counts[verdict] for verdict in VERDICTS}
+    assert sum(found["verdicts"].values()) == len(claims) == 23
+    results = load(runs, "quick")
+    finished = results.runs[results.runs["study"].isin(results.studies)]["status"].eq("finished").sum()
+    assert found["runs"]["finished"] == finished <= found["runs"]["planned"]
+    assert list(found["finals"]) == ["navigation", "coverage", "ablation"]
+    assert found["finals"]["ablation"]["full"] == pytest.approx(results.finals("ablation", "full").mean(), abs=1e-4)
+    for name, finals in found["finals"].items():
+        assert list(finals) == [arm for arm in results.arms(name) if len(results.finals(name, arm))]
 
 
 def test_claims_as_json(made: Path) -> None:
