@@ -59,7 +59,7 @@ CONTENTS = {
         "docs/overhead",
     ],
     "Results": ["docs/learning", f"{RESULTS}/index", "docs/speed"],
-    "Reference": ["docs/cli", f"{REFERENCE}/verbs", "docs/ui", "docs/dvc", "docs/dvc", f"{REFERENCE}/settings"],
+    "Reference": ["docs/cli", f"{REFERENCE}/verbs", "docs/ui", "docs/dvc", f"{REFERENCE}/settings"],
     "Project": ["docs/architecture", "CONTRIBUTING", "CHANGELOG", "benchmarks/README"],
 }
 
