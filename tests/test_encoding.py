@@ -28,7 +28,7 @@ def test_what_follows_the_locale_is_seen(call: str) -> None:
 @pytest.mark.parametrize(
     "call",
     ["p.read_text(encoding='utf-8')", "p.open('rb')", "open('x', mode='wb')", "run(['x'], text=True, encoding='utf-8')",
-     "run(['x'])", "os.open('x', os.O_RDONLY)"],
+     "run(['x'])", "os.open('x', os.O_RDONLY)", "Image.open(file)"],
 )  # fmt: skip
 def test_what_says_its_encoding_or_is_no_text_passes(call: str) -> None:
     assert not list(following(call.encode()))
@@ -48,7 +48,7 @@ def following(source: bytes) -> Iterator[ast.Call]:
 def _opens(call: ast.Call, given: dict[str | None, ast.expr]) -> bool:
     """True if it reads or writes a file as text."""
     if isinstance(call.func, ast.Attribute):
-        return call.func.attr in TEXT and not _binary(call, given) and not _of(call, "os", "zipfile")
+        return call.func.attr in TEXT and not _binary(call, given) and not _of(call, "os", "zipfile", "Image")
     return getattr(call.func, "id", "") == "open" and not _binary(call, given)
 
 
