@@ -68,10 +68,11 @@ def page(report: Report) -> Iterator[str]:
 
 
 def _body(table: Table) -> str:
-    """A table; a long one is folded away."""
-    if len(table.shown) <= LONG:
+    """A table; of a long one the first rows, and how many more there are."""
+    more = len(table.shown) - LONG
+    if more <= 0:
         return table.markdown()
-    return f"<details><summary>{len(table.shown)} rows</summary>\n\n{table.markdown()}\n\n</details>"
+    return f"{table._replace(shown=table.shown.head(LONG)).markdown()}\n\n{more} more rows:"
 
 
 def _figure(picture: Picture) -> Iterator[str]:

@@ -244,7 +244,7 @@ def test_hundreds_of_pairs_are_folded_and_the_clear_ones_come_first(tmp_path: Pa
     cells = [line.split(" | ")[6] for line in clear]
     assert cells == sorted(cells, reverse=True)
     assert set(cells) == {"yes", "no"}
-    assert "<details><summary>78 rows</summary>" in (tmp_path / "out" / "index.md").read_text()
+    assert "\n\n12 more rows:\n\n[CSV](tables/pairs_reach.csv)" in (tmp_path / "out" / "index.md").read_text()
 
 
 @pytest.mark.usefixtures("unpainted")
