@@ -1,6 +1,7 @@
 """Parts that tests of several rooms build from: generators, observations, and networks with known outputs."""
 
 from collections.abc import Callable
+from copy import copy
 
 import torch
 from torch import Generator, Tensor, nn
@@ -39,6 +40,17 @@ def constant(net: nn.Module, out: list[float]) -> Tensor:
             p.zero_()
         weights[-1].copy_(torch.tensor(out).expand_as(weights[-1].view(-1, len(out))).reshape(weights[-1].shape))
     return weights[-1]
+
+
+def copied(state: Any) -> Any:
+    """The same content in new dicts, lists and tensors of the same kinds, in less time than `copy.deepcopy` takes."""
+    if isinstance(state, dict):
+        fresh = copy(state)
+        fresh.update({key: copied(value) for key, value in state.items()})
+        return fresh
+    if isinstance(state, list | tuple):
+        return type(state)(map(copied, state))
+    return state.clone() if isinstance(state, Tensor) else state
 
 
 def changing(text: str) -> Callable[[str, str], str]:

@@ -186,9 +186,14 @@ def _canonical(node: ast.AST) -> Iterator[str]:
         for part in value if isinstance(value, list) else [value]:
             if not isinstance(part, ast.AST):
                 yield json.dumps(part)
-            elif _counts(part):
+            elif _counts(part) and not _nothing(node, part):
                 yield from _canonical(part)
     yield ")"
+
+
+def _nothing(node: ast.AST, part: ast.AST) -> bool:
+    """True of an empty text in an f-string, which Python 3.12 puts behind a format that is computed."""
+    return isinstance(node, ast.JoinedStr) and isinstance(part, ast.Constant) and part.value == ""
 
 
 def _constant(value: object) -> str:

@@ -15,7 +15,7 @@ from reports.analyses import readings
 from reports.data.escaping import stem
 from reports.data.frame import Results, load
 from reports.data.paper import read as paper
-from reports.pages import build, gallery
+from reports.pages import gallery, sheets
 from reports.render.canvas import QUIET
 from tests.reports.factory import study, write, yardsticks
 
@@ -284,7 +284,7 @@ def test_colours_say_on_which_side_of_zero_an_interval_is(tmp_path: Path) -> Non
 
 def test_a_study_with_readings_has_its_own_tables_and_figures(tmp_path: Path) -> None:
     results = read(tmp_path, by_alpha)
-    names = set(build._study_tables(results, "read"))
+    names = set(sheets.of_study(results, "read"))
     assert names == {"effects_read", "factors_read", "readings_read", "final_read"}
     pictures = gallery.study_gallery(results, paper(), "read")
     assert [one.name for one in pictures] == [f"readings_{stem('no regulation')}_read"]
