@@ -226,7 +226,7 @@ def _logged(study: Study, code: Code, home: Home, display: Board, arms: Sequence
             display.say(f"{study.name}: {remark}")
         plan = items(study, *code)
         recorder = Recorder(card, plan, tracker, home, display, arms)
-        if study.file:
+        if study.file and not any(item.spec.imports for item in plan):  # whose code a kept plan does not know
             options = Options(study.file, study.profile, study.variant, study.overrides)
             runs = {item.name: Place(item.card.arm, item.key) for item in plan}
             keep(home, options, KeptPlan(study.name, runs, list(study.remarks)))

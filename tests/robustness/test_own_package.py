@@ -17,6 +17,7 @@ from pipelines.specs.study import RunSpec, Study
 from rhmc.training.trainer import Trainer
 from tests.pipelines.own_package import STUDY, untouched, write
 from tests.pipelines.support import Said, all_end, run_rhmc
+from tests.robustness.chaos import WORKER
 
 OWN = "studies/own.yaml"
 TEXT = STUDY.replace("evaluations: 3", "evaluations: 30").replace("steps: 600", "steps: 9000") + (
@@ -68,7 +69,7 @@ def launched(tmp_path_factory: pytest.TempPathFactory, template: Path) -> Launch
             time.sleep(0.02)
         process.kill()
     assert process.wait() == -9, (folder / "first.txt").read_text()
-    assert all_end(process.pid, "ray::")  # its agents take a minute more
+    assert all_end(process.pid, WORKER)  # Ray's own agents take a minute more to miss their raylet
     done = subprocess.run([*COMMAND, "study", "run", OWN], capture_output=True, text=True, check=False, **how)  # type: ignore[call-overload]
     assert done.returncode == 0, done.stdout + done.stderr
     return Launched(folder, done.stdout + done.stderr)
