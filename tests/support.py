@@ -5,15 +5,10 @@ from copy import copy
 from typing import Any
 
 import torch
-from torch import Generator, Tensor, nn
+from torch import Tensor, nn
 
 from rhmc.learning.learner import pack
 from rhmc.types import Batch, Obs, Spec
-
-
-def seeded(seed: int = 0) -> Generator:
-    """A generator that draws the same numbers in every test."""
-    return Generator().manual_seed(seed)
 
 
 def observation(spec: Spec, batch: int = 1, *, first: bool = False) -> Obs:
@@ -21,11 +16,6 @@ def observation(spec: Spec, batch: int = 1, *, first: bool = False) -> Obs:
     n, m = spec.agents, spec.targets
     pairs, agents = torch.randn(batch, n, m, spec.pair_features), torch.randn(batch, n, spec.agent_features)
     return Obs(agents, pairs, torch.randn(batch, n, n, spec.peer_features), torch.full((batch,), first))
-
-
-def reordered(obs: Obs, order: list[int]) -> Obs:
-    """The same observation with its agents in another order."""
-    return Obs(obs.agents[:, order], obs.pairs[:, order], obs.peers[:, order][:, :, order], obs.first)
 
 
 def observed(spec: Spec, batch: int) -> Batch:

@@ -97,15 +97,14 @@ def _tell(one: "Outcome") -> None:
 
 
 def _changes(texts: Iterable[str]) -> dict[str, Any]:
-    """Settings as a nested mapping."""
+    """Settings by dotted name."""
     from pipelines.specs.document import override, plain
 
-    tree: dict[str, Any] = {}
+    found: dict[str, Any] = {}
     for text in texts:
         key, equals, value = text.partition("=")
         node, faults = override(f"--set {text}", key, value)
         if faults or node is None or not equals or not key:
             raise InputError(*(map(str, faults) if faults else [f"--set {text}: must be KEY=VALUE, as in gamma=0.8"]))
-        block, _, field = key.rpartition(".")
-        (tree.setdefault(block, {}) if block else tree)[field] = plain(node)
-    return tree
+        found[key] = plain(node)
+    return found

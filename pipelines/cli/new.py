@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipelines.cli.common import say
+from pipelines.cli.common import folder_option, say
 
 if TYPE_CHECKING:
     from pipelines.conformance.scaffold import What
@@ -30,6 +30,7 @@ def task(name: Name, out: Out = Path()) -> None:
 def _create(what: "What", name: str, out: Path) -> None:
     from pipelines.conformance.scaffold import create
 
-    page, *_ = create(what, name, out)
+    with folder_option(out):
+        page, *_ = create(what, name, out)
     say(f"wrote {page.parents[1]}; the {what} is {page}")
     say(f"next:  cd {page.parents[1]} && rhmc conformance {name}.{what}")

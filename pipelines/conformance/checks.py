@@ -5,13 +5,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import torch
-from pydantic import BaseModel
 from torch import Generator, Tensor
 
-from pipelines.specs.document import settings
+from pipelines.conformance.same import DifferentError, assert_same
 from pipelines.workspace.work_folder import one_line
 from rhmc.envs.base import Env
 from rhmc.training.trainer import Config
+from rhmc.types import Obs
 
 
 class Unfit(Exception):  # noqa: N818  # it says of a check that it does not apply
@@ -69,15 +69,17 @@ def need(holds: bool, otherwise: str) -> None:
         raise AssertionError(otherwise)
 
 
-def fitted(config: type[BaseModel], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Of the values those that the configuration has, as a file has them; one goes to every block with such a field."""
-    tree: dict[str, Any] = {}
-    for name in settings(config):
-        block, _, field = name.rpartition(".")
-        key = name if name in values else field
-        if key in values:
-            (tree.setdefault(block, {}) if block else tree)[field] = values[key]
-    return tree
+def need_difference(a: Any, b: Any, otherwise: str) -> None:
+    """A requirement that two states are not the same.
+
+    Raises:
+        AssertionError: they are.
+    """
+    try:
+        assert_same(a, b)
+    except DifferentError:
+        return
+    raise AssertionError(otherwise)
 
 
 def through_a_file(state: Any) -> Any:
@@ -88,9 +90,14 @@ def through_a_file(state: Any) -> Any:
     return torch.load(file, weights_only=True)
 
 
-def seeded(seed: int) -> Generator:
-    """A generator on the CPU."""
+def seeded(seed: int = 0) -> Generator:
+    """A generator on the CPU that draws the same numbers each time."""
     return Generator().manual_seed(seed)
+
+
+def reordered(obs: Obs, order: list[int]) -> Obs:
+    """The same observation with its agents in another order."""
+    return Obs(obs.agents[:, order], obs.pairs[:, order], obs.peers[:, order][:, :, order], obs.first)
 
 
 def at_random(env: Env, rng: Generator) -> Tensor:

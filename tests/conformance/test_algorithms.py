@@ -12,8 +12,9 @@ from torch import Generator, Tensor
 from torch.nn import functional
 from torch.overrides import TorchFunctionMode
 
-from pipelines.conformance import toy
-from pipelines.conformance.checks import through_a_file
+from pipelines.conformance import checks, toy
+from pipelines.conformance.blocks import fitted, nested
+from pipelines.conformance.checks import reordered, seeded, through_a_file
 from pipelines.conformance.same import DifferentError, assert_same
 from pipelines.specs.document import settings
 from pipelines.tracking.plan import flatten
@@ -24,24 +25,12 @@ from rhmc.learning.learner import Learner, Replay
 from rhmc.networks.nets import Unshared
 from rhmc.training.trainer import Config, Trainer
 from rhmc.types import Batch, Obs, Transition
-from tests.blocks import fitted, nested
-from tests.support import copied, reordered, seeded
+from tests.support import copied
 
 EPISODE = 7  # of both tasks here, so that runs of a few steps cross its end
-SMALL = {
-    "hidden_dim": 8,
-    "pretrain": 20,
-    "buffer_size": 20,
-    "batch_size": 8,
-    "learning_starts": 8,
-    "train_freq": 4,
-    "n_steps": 3,
-    "epochs": 2,
-    "minibatches": 2,
-    "assignment_period": 1,
-}
+SMALL = checks.SMALL | {"assignment_period": 1}
 RUN = Config(steps=36, num_envs=4, evaluations=4, eval_episodes=2, final_episodes=2)  # ends at steps 12 20 28 36
-LONGER = RUN.model_copy(update={"steps": 44, "evaluations": 5})  # where a coordinator first learns at step 44
+LONGER = checks.RUN  # ends at steps 12 20 28 36 44: where a coordinator first learns at step 44
 TASKS: dict[str, Any] = {
     "coverage": coverage.Config(agents=2, targets=3),
     "navigation": navigation.Config(agents=2, episode=EPISODE),

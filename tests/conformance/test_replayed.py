@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from torch import Generator
 
+from pipelines.conformance.blocks import fitted, nested
 from pipelines.specs.study import RunSpec, Study
 from reports.analyses.settings import replayed
 from rhmc.algorithms import ALGORITHMS, coma, ppo
@@ -21,7 +22,6 @@ from rhmc.learning.experience import minibatches
 from rhmc.learning.learner import Replay
 from rhmc.training.trainer import Config, Trainer
 from rhmc.types import Batch
-from tests.blocks import fitted, nested
 
 ROOT = Path(__file__).parents[2]
 STEPS = 1600  # of 8 copies: two episodes each; half of them HiT-MAC's executors practise

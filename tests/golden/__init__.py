@@ -13,6 +13,7 @@ from typing import Any
 
 from torch import Tensor
 
+from pipelines.conformance.blocks import fitted, nested
 from pipelines.export.tables import write_tables
 from pipelines.specs.study import Setting
 from pipelines.tracking.plan import flatten, items, study_card
@@ -21,7 +22,6 @@ from rhmc.envs import ENVS
 from rhmc.learning.learner import Learner
 from rhmc.training.trainer import Trainer
 from rhmc.yardsticks.scores import play_yardsticks
-from tests.blocks import fitted, nested
 from tests.memory_tracker import MemoryTracker
 from tests.pipelines.support import lasting, tiny
 

@@ -14,13 +14,13 @@ import psutil
 import pytest
 
 from pipelines.cli import main as cli
+from pipelines.conformance.blocks import fitted, nested
 from pipelines.specs.identity import code_id
 from pipelines.specs.study import Resources, RunSpec, Setting, Study
 from pipelines.tracking.plan import Item, items
 from pipelines.workspace.process_pool import side_by_side
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import coverage
-from tests.blocks import fitted, nested
 
 CODE = code_id("iql", "navigation")  # of all runs here
 

@@ -768,6 +768,12 @@ def test_a_kind_that_there_is_not_is_one_line(rhmc: Rhmc, words: list[str], said
     assert err.startswith(said)
 
 
+def test_a_new_package_needs_a_folder(rhmc: Rhmc, tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    assert rhmc("new", "task", "mine", "--out", str(file)) == (2, "", f"--out: {file} is not a folder\n")
+
+
 def test_fingerprint_is_printed_or_written_where_it_differs(rhmc: Rhmc) -> None:
     text = fingerprint() + "\n"
     assert rhmc("fingerprint") == (0, text, "")

@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 import torch
 
+from pipelines.conformance.blocks import fitted, nested
 from pipelines.execution.cluster import here
 from pipelines.execution.finite import DivergedError, check, defined
 from pipelines.execution.seed_group import Seeds
@@ -31,7 +32,6 @@ from pipelines.workspace.work_folder import (
 )
 from rhmc.algorithms import ALGORITHMS
 from rhmc.training.trainer import Trainer
-from tests.blocks import fitted, nested
 from tests.pipelines.support import setting, spec
 from tests.robustness.chaos import DAMAGES, damaged
 

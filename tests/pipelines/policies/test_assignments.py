@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 import torch
 
+from pipelines.conformance.blocks import fitted, nested
 from pipelines.policies import assignments
 from pipelines.policies.assignments import Watch, counts, export_assignments, rows_of, watched
 from pipelines.specs.study import Study
@@ -15,7 +16,6 @@ from rhmc.algorithms import ALGORITHMS
 from rhmc.hierarchy.theorem import smallest_counterexample
 from rhmc.training.trainer import Trainer
 from rhmc.types import Local, Obs, Transition
-from tests.blocks import fitted, nested
 from tests.pipelines.support import jobs_of, run_rhmc, setting, tiny
 
 

@@ -5,12 +5,12 @@ from typing import Any
 import pytest
 from pydantic import BaseModel, ValidationError
 
+from pipelines.conformance.blocks import nested
 from pipelines.specs.document import settings
 from pipelines.specs.fields import Described, described
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import ENVS
 from rhmc.training import trainer
-from tests.blocks import nested
 
 MODELS = {kind: entry.config for table in (ALGORITHMS, ENVS) for kind, entry in table.items()}
 MODELS["trainer"] = trainer.Config

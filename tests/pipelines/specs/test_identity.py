@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic.fields import FieldInfo
 
+from pipelines.conformance.blocks import nested
 from pipelines.specs import identity
 from pipelines.specs.document import settings as of_config
 from pipelines.specs.identity import TRAINER, code_id, combined, fingerprint, folder_of, modules
@@ -23,7 +24,6 @@ from pipelines.specs.syntax import Code
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import ENVS
 from rhmc.training.trainer import Config as TrainerConfig
-from tests.blocks import nested
 
 ROOT = Path(__file__).parents[3]
 PLACES = [(method, task) for method in ALGORITHMS for task in ENVS]

@@ -10,6 +10,7 @@ from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
 from pipelines.cli.main import app
+from pipelines.conformance.blocks import fitted, nested
 from pipelines.execution.run import run_studies
 from pipelines.specs import limits
 from pipelines.specs.document import Node, Place, validate
@@ -22,7 +23,6 @@ from rhmc.algorithms import ALGORITHMS
 from rhmc.learning.learner import Learner
 from rhmc.training import trainer
 from rhmc.training.trainer import Trainer
-from tests.blocks import fitted, nested
 from tests.pipelines.support import setting, tiny
 
 ROOT = Path(__file__).parents[3]

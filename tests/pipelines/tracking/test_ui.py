@@ -13,6 +13,7 @@ import mlflow
 import pytest
 from PIL import Image
 
+from pipelines.conformance.blocks import fitted, nested
 from pipelines.specs.safe_names import HEADLINES, full, shown
 from pipelines.specs.study import Setting
 from pipelines.tracking import arm_colours, mlflow_tracker, overview, saved_views
@@ -22,7 +23,6 @@ from pipelines.tracking.plan import study_card
 from pipelines.tracking.tracker import Card, StudyCard, points_of
 from pipelines.workspace.work_folder import Home
 from rhmc.algorithms import ALGORITHMS
-from tests.blocks import fitted, nested
 from tests.memory_tracker import MemoryRun, MemoryTracker
 from tests.pipelines.support import plan, setting, tiny
 

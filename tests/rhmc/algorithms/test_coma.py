@@ -10,12 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
+from pipelines.conformance.checks import seeded
 from pipelines.conformance.same import assert_same
 from rhmc.algorithms.coma import COMA, Config, draw, expected
 from rhmc.learning.experience import flat
 from rhmc.learning.learner import taken
 from rhmc.types import Batch, Local, Spec, Transition
-from tests.support import constant, observation, seeded
+from tests.support import constant, observation
 
 SPEC = Spec(2, 3, agent_features=1, pair_features=4, peer_features=0, actions=3, continuous=False, episode=9)
 N, M, ACTIONS = SPEC.agents, SPEC.targets, SPEC.actions

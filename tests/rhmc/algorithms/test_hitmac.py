@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Generator, Tensor, nn
 
-from pipelines.conformance.checks import through_a_file
+from pipelines.conformance.blocks import nested
+from pipelines.conformance.checks import seeded, through_a_file
 from pipelines.conformance.same import DifferentError, assert_same
 from rhmc.algorithms.hitmac import PRACTISED, Config, HiTMAC, practice
 from rhmc.envs import coverage, make_env
@@ -21,8 +22,7 @@ from rhmc.networks.nets import Sizes
 from rhmc.training.trainer import Config as Budget
 from rhmc.training.trainer import Trainer
 from rhmc.types import Batch, Local, Obs, Spec, Transition
-from tests.blocks import nested
-from tests.support import observation, seeded
+from tests.support import observation
 
 pytestmark = pytest.mark.usefixtures("short_episodes")
 SPEC = Spec(2, 3, agent_features=0, pair_features=4, peer_features=0, actions=3, continuous=False, episode=7)

@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Size, Tensor, nn
 
+from pipelines.conformance.checks import seeded
 from pipelines.conformance.same import assert_same
 from rhmc.algorithms.maddpg import MADDPG, Config
 from rhmc.envs import make_env, navigation
@@ -16,7 +17,7 @@ from rhmc.networks.sampling import gumbel, straight_through
 from rhmc.training.trainer import Config as Run
 from rhmc.training.trainer import Trainer
 from rhmc.types import Batch, Obs, Spec
-from tests.support import observation, observed, seeded
+from tests.support import observation, observed
 
 N, A = 3, 2
 SPEC = Spec(N, 2, agent_features=1, pair_features=4, peer_features=2, actions=A, continuous=False, episode=9)

@@ -10,11 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
+from pipelines.conformance.checks import seeded
 from rhmc.algorithms import ALGORITHMS, ppo
 from rhmc.algorithms.ppo import PPO, Clip, Config, Penalty
 from rhmc.networks.nets import ENCODERS, Sizes, Unshared
 from rhmc.types import Local, Obs, Spec, Transition
-from tests.support import constant, observation, seeded
+from tests.support import constant, observation
 
 SPEC = Spec(2, 3, agent_features=1, pair_features=2, peer_features=1, actions=3, continuous=False, episode=9)
 N, M, A = SPEC.agents, SPEC.targets, SPEC.actions

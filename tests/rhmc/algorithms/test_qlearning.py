@@ -9,13 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
+from pipelines.conformance.checks import seeded
 from rhmc.algorithms import ALGORITHMS
 from rhmc.algorithms.qlearning import QLearning
 from rhmc.learning.schedules import linear
 from rhmc.networks.nets import ENCODERS, Sizes, Unshared, mix, team
 from rhmc.types import Batch, Obs, Spec
 from tests.doubles import Known
-from tests.support import observation, observed, seeded
+from tests.support import observation, observed
 
 SPEC = Spec(2, 3, agent_features=1, pair_features=4, peer_features=2, actions=3, continuous=False, episode=9)
 SIZES = Sizes.of(SPEC)

@@ -2,11 +2,11 @@
 
 import pytest
 
+from pipelines.conformance.blocks import nested
 from rhmc.algorithms import rhmc
 from rhmc.envs import coverage
 from rhmc.training.trainer import Config, Trainer
 from rhmc.types import Batch
-from tests.blocks import nested
 
 
 @pytest.mark.parametrize("every", [1, 2, 3])

@@ -11,11 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from pipelines.conformance.checks import seeded
 from rhmc.envs import coverage, make_env
 from rhmc.envs.coverage import Config, State
 from rhmc.types import Obs, Step, assigned_reward
 from tests.oracles import coverage as oracle
-from tests.support import seeded
 
 PRESETS = ("flat", "executor", "coordinator")
 WORLDS = 6  # rows in a comparison with the oracle

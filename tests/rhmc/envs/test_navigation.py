@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from mpe2 import simple_spread_v3
 from torch import Tensor
 
+from pipelines.conformance.checks import seeded
 from rhmc.envs import make_env, navigation
 from rhmc.envs.base import Env
 from rhmc.types import Obs, assigned_reward
 from tests.oracles import navigation as oracle
-from tests.support import seeded
 
 REWARDS = ("paper", "mpe2", "mpe1")
 ORDERS = ("mpe2", "mpe1")

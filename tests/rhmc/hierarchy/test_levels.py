@@ -8,6 +8,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from pipelines.conformance.blocks import nested
+from pipelines.conformance.checks import seeded
 from rhmc.algorithms import ALGORITHMS
 from rhmc.algorithms.rhmc import RHMC, Config
 from rhmc.envs import coverage, make_env, navigation
@@ -19,9 +21,8 @@ from rhmc.learning.learner import Learner, unpack
 from rhmc.learning.normalisation import KEPT
 from rhmc.networks.nets import ENCODERS, PairNet, Sizes, append
 from rhmc.types import Batch, Obs, Spec, Transition, assigned_reward
-from tests.blocks import nested
 from tests.oracles import regulation as oracle
-from tests.support import constant, observation, observed, seeded
+from tests.support import constant, observation, observed
 
 pytestmark = pytest.mark.usefixtures("short_episodes")
 SPEC = Spec(2, 3, agent_features=1, pair_features=4, peer_features=0, actions=3, continuous=False, episode=9)

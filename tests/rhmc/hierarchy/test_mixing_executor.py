@@ -7,13 +7,14 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from pipelines.conformance.blocks import nested
+from pipelines.conformance.checks import seeded
 from rhmc.algorithms.rhmc import Config
 from rhmc.envs import coverage, make_env
 from rhmc.hierarchy.mixing_executor import QMIXExecutor
 from rhmc.types import Batch, Obs, Spec, Transition
-from tests.blocks import nested
 from tests.doubles import Known
-from tests.support import observed, seeded
+from tests.support import observed
 
 SPEC = Spec(2, 3, agent_features=1, pair_features=4, peer_features=0, actions=3, continuous=False, episode=9)
 N, M = SPEC.agents, SPEC.targets

@@ -6,12 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from pipelines.conformance.checks import through_a_file
+from pipelines.conformance.checks import seeded, through_a_file
 from pipelines.conformance.same import assert_same
 from rhmc.learning.experience import Experience, Rollout, ends, flat, values
 from rhmc.learning.settings import OffPolicy
 from rhmc.types import Batch, Local, Obs, Transition
-from tests.support import seeded
 
 N, M = 2, 3
 CPU = torch.device("cpu")

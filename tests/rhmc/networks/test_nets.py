@@ -9,11 +9,11 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from pipelines.conformance.checks import reordered
 from rhmc.envs import coverage, make_env, navigation
 from rhmc.networks.linear import Linear
 from rhmc.networks.nets import ENCODERS, Sizes, append, mlp
 from rhmc.types import Obs
-from tests.support import reordered
 
 HIDDEN, OUT = 8, 3
 Make = Callable[[Sizes], nn.Module]

@@ -7,13 +7,13 @@ import torch
 from torch import Generator, Tensor
 
 from pipelines.conformance import toy
+from pipelines.conformance.blocks import fitted, nested
 from pipelines.conformance.same import assert_same
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import ENVS, Task, coverage, make_env, navigation
 from rhmc.training.evaluation import CHUNK, Episodes, evaluate
 from rhmc.training.trainer import Config, Trainer
 from rhmc.types import Obs, Transition
-from tests.blocks import fitted, nested
 
 SHORT = navigation.Config(episode=4, agents=2)
 

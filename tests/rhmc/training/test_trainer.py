@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from torch import Generator, Tensor, nn
 
 from pipelines.conformance import toy
+from pipelines.conformance.blocks import fitted, nested
 from pipelines.conformance.same import assert_same
 from rhmc.algorithms import ALGORITHMS
 from rhmc.algorithms import rhmc as rhmc_page
@@ -19,7 +20,6 @@ from rhmc.envs import ENVS, Task
 from rhmc.learning.learner import Learner, Learners
 from rhmc.training.trainer import Config, Means, Trainer, grid_step
 from rhmc.types import Frozen, Metrics, Obs, Spec, Transition
-from tests.blocks import fitted, nested
 
 ENVIRONMENTS = 4
 

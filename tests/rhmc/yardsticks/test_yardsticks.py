@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
+from pipelines.conformance.checks import seeded
 from rhmc.envs import coverage, make_env, navigation
 from rhmc.yardsticks import BOUNDS, POLICIES, joint, scores
 from rhmc.yardsticks import coverage as sensors
 from rhmc.yardsticks import navigation as steering
 from rhmc.yardsticks.scores import play_yardsticks
 from tests.oracles import coverage as oracle
-from tests.support import seeded
 
 quick = settings(deadline=None, max_examples=25)
 seeds = st.integers(0, 2**31)
