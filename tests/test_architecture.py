@@ -47,7 +47,7 @@ ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
         "yardsticks": ("registry", "envs"),
         "networks": ("types", "portable"),
         "learning": ("types", "networks"),
-        "hierarchy": ("types", "networks", "learning"),
+        "hierarchy": ("types", "registry", "networks", "learning"),
         "algorithms": ("types", "registry", "networks", "learning", "hierarchy"),
         "training": ("types", "envs", "learning", "algorithms"),
     },

@@ -35,20 +35,20 @@ def conformance(
     steps: Annotated[int, typer.Option(min=1, help="Environment steps of the run that is to learn.")] = STEPS,
     as_json: Json = False,
 ) -> None:
-    """Check methods and tasks: bit-identical resume, one seed one run, no trace of evaluation, learning, and more.
+    """Check methods, tasks and coordinators: exact resume, one seed one run, no trace of evaluation, learning, more.
 
     Exit code 4 where a check does not hold.
     """
-    from pipelines.specs.plugins import VARIABLE, configs, discover
+    from pipelines.specs.plugins import COORDINATOR, TABLES, VARIABLE, discover, page
     from pipelines.workspace.own_packages import top_of
 
     if module is not None:
         os.environ[VARIABLE] = ",".join(filter(None, (os.environ.get(VARIABLE, ""), module)))
     discover()
-    wanted = {"algo": list(method or ()), "env": list(task or ())}
+    wanted: dict[str, list[str]] = {"algo": list(method or ()), "env": list(task or ()), COORDINATOR: []}
     if module is not None:
         for section, kinds in wanted.items():
-            own = {kind for kind, one in configs(section).items() if top_of(one.__module__) == top_of(module)}
+            own = {kind for kind, one in TABLES[section].items() if top_of(page(one)) == top_of(module)}
             kinds += sorted(own - set(kinds))
     if not any(wanted.values()):
         raise InputError("nothing to check: name a module, or --method, or --task")
@@ -65,23 +65,30 @@ def conformance(
 def _outcomes(wanted: dict[str, list[str]], changes: dict[str, Any], steps: int, *, quiet: bool) -> Iterator["Outcome"]:
     from pydantic import ValidationError
 
-    from pipelines.conformance.methods import check_method
-    from pipelines.conformance.tasks import check_task
-    from pipelines.specs.plugins import configs
+    from pipelines.specs.plugins import TABLES
 
     for section, kinds in wanted.items():
         for kind in kinds:
-            if kind not in configs(section):
+            if kind not in TABLES[section]:
                 _unknown(section, kind)
             try:
-                made = check_method(kind, changes, steps) if section == "algo" else check_task(kind, changes)
-                for one in made:
+                for one in _checks(section, kind, changes, steps):
                     if not quiet:
                         _tell(one)
                     yield one
             except ValidationError as error:
                 first = error.errors()[0]
                 raise InputError(f"--set: {kind}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+
+
+def _checks(section: str, kind: str, changes: dict[str, Any], steps: int) -> Iterator["Outcome"]:
+    """Of a coordinator: those of RHMC with it."""
+    from pipelines.conformance.methods import check_method
+    from pipelines.conformance.tasks import check_task
+
+    if section == "env":
+        return check_task(kind, changes)
+    return check_method(kind, changes, steps) if section == "algo" else check_method("rhmc", changes, steps, kind)
 
 
 def _unknown(section: str, kind: str) -> None:

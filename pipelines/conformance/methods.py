@@ -25,6 +25,7 @@ from pipelines.conformance.checks import (
     through_a_file,
 )
 from pipelines.conformance.same import assert_same
+from pipelines.specs import limits
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import ENVS, Task, coverage, make_env, navigation
 from rhmc.training.evaluation import evaluate
@@ -56,27 +57,29 @@ class Case(NamedTuple):
     env: Any
 
 
-def check_method(kind: str, changes: dict[str, Any], steps: int) -> Iterator[Outcome]:
+def check_method(kind: str, changes: dict[str, Any], steps: int, coordinator: str = "") -> Iterator[Outcome]:
     """Every check of a method.
 
     Args:
         kind: a registered method.
         changes: settings of the run that is to learn, by dotted name.
         steps: budget of that run.
+        coordinator: that assigns in all runs, if it is not the method's own; a registered name.
 
     Raises:
         pydantic.ValidationError: a change that the method does not have.
     """
-    config = ALGORITHMS[kind].config
-    learner = config.model_validate(nested(fitted(config, LEARNING) | changes))
-    small = config.model_validate(nested(fitted(config, SMALL)))
+    config, chosen = ALGORITHMS[kind].config, {"coordinator.method": coordinator} if coordinator else {}
+    learner = config.model_validate(nested(fitted(config, LEARNING) | chosen | changes))
+    small = config.model_validate(nested(fitted(config, SMALL) | chosen))
+    subject = f"{kind} with {coordinator}" if coordinator else kind
     for env in SMALL_TASKS:
-        if fault := misfit(env, small):
-            yield Outcome(kind, f"acts in {env.kind}", left_out=fault)
+        if fault := misfit(env, small) or limits.misfit(env, small):
+            yield Outcome(subject, f"acts in {env.kind}", left_out=fault)
             continue
-        yield from outcomes(f"{kind} in {env.kind}", Case(small, env), CHECKS)
-    yield from outcomes(kind, Case(small, None), [agents_in_another_order_do_the_same])
-    yield from outcomes(kind, (learner, steps), [learns_the_tiny_task])
+        yield from outcomes(f"{subject} in {env.kind}", Case(small, env), CHECKS)
+    yield from outcomes(subject, Case(small, None), [agents_in_another_order_do_the_same])
+    yield from outcomes(subject, (learner, steps), [learns_the_tiny_task])
 
 
 def _trainer(case: Case, seed: int = 0, **changes: Any) -> Trainer:
@@ -185,7 +188,8 @@ def agents_in_another_order_do_the_same(case: Case) -> None:
     if "encoder" not in config.model_fields:
         raise Unfit("it has no setting `encoder`")
     env = navigation.Config(agents=4, observation="extended", episode=7)
-    algo, obs = _built(Case(config.model_validate(nested(fitted(config, SMALL) | {"encoder": "pairwise"})), env), 30)
+    _fit(env, case.algo)
+    algo, obs = _built(Case(case.algo.model_copy(update={"encoder": "pairwise"}), env), 30)
     seen = obs, reordered(obs, ORDER)
     here, there = (algo.act(one, algo.carry(30), seeded(0), explore=False)[0] for one in seen)
     need(torch.equal(there, here[:, ORDER]), "agents in another order do something else")
@@ -197,9 +201,15 @@ def learns_the_tiny_task(given: tuple[Any, int]) -> None:
     best = toy.own_target()
     run = BUDGET.model_copy(update={"steps": steps})
     with _toy():
+        _fit(toy.Config(), algo)
         found = max(item["eval/return"] for item in Trainer(toy.Config(), algo, run, 0))
     asked = f"{found:.2f} at best within {steps:,} steps, and {LEARNED * best:.2f} are asked for"
     need(found > LEARNED * best, f"{asked}; give --steps, or settings that suit it with --set")
+
+
+def _fit(env: Any, algo: Any) -> None:
+    if fault := limits.misfit(env, algo):
+        raise Unfit(fault)
 
 
 @contextmanager

@@ -21,6 +21,7 @@ from pipelines.conformance.checks import (
     through_a_file,
 )
 from pipelines.conformance.same import assert_same
+from pipelines.specs import limits
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import ENVS, make_env
 from rhmc.envs.base import Env
@@ -44,7 +45,7 @@ def check_task(kind: str, changes: dict[str, Any]) -> Iterator[Outcome]:
     for method in ALGORITHMS:
         config = ALGORITHMS[method].config
         algo = config.model_validate(nested(fitted(config, SMALL)))
-        if fault := misfit(env, algo):
+        if fault := misfit(env, algo) or limits.misfit(env, algo):
             yield Outcome(kind, f"{method} trains in it", left_out=fault)
             continue
         for one in outcomes(kind, (env, algo), [_trains]):

@@ -191,7 +191,7 @@ def check_plugins(spec: RunSpec, key: str) -> None:
     Raises:
         StoreError: they are not.
     """
-    if spec.imports and code_id(spec.algo.kind, spec.env.kind) != key.rpartition("-")[2]:
+    if spec.imports and code_id(spec.algo.kind, spec.env.kind, spec.imports) != key.rpartition("-")[2]:
         packages = ", ".join(sorted({top_of(module) for module in spec.imports}))
         raise StoreError(f"node {here()} has other code of {packages} than the launch began with: launch it again")
 

@@ -13,7 +13,7 @@ from torch import Generator, Tensor, nn
 from rhmc.algorithms.rhmc import RHMC, Config
 from rhmc.envs import coverage, make_env
 from rhmc.hierarchy import executor
-from rhmc.hierarchy.coordinator import assignment_value
+from rhmc.hierarchy.coordinator import Coordinator, assignment_value
 from rhmc.types import Obs
 
 TASK = {"agents": 4, "targets": 5}  # section 5.2
@@ -71,6 +71,7 @@ def _networks(method: RHMC, obs: Obs) -> Iterator[Record]:
     """The four networks, each called as learning calls it."""
     low, high, spec = method.executor, method.coordinator, method.spec
     assert isinstance(low, executor.Executor)
+    assert isinstance(high, Coordinator)
     shape = (1, spec.agents, spec.targets)
     assignment, joint = torch.ones(shape), torch.zeros(1, spec.agents, spec.actions)
     seen = {"own features": obs.agents, "pairs": obs.pairs, "peers": obs.peers}

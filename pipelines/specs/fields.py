@@ -29,7 +29,12 @@ def described(model: type[BaseModel]) -> list[Described]:
 
 
 def allowed(field: FieldInfo) -> str:
-    """The values of a field: those that it lists, or a type with its bounds."""
+    """The values of a field: those that it lists or that its table has now, or a type with its bounds."""
+    schema: dict[str, Any] = {}
+    if callable(field.json_schema_extra):
+        field.json_schema_extra(schema)
+    if "enum" in schema:
+        return ", ".join(schema["enum"])
     stated = [(word, getattr(one, name, None)) for one in field.metadata for name, word in BOUNDS.items()]
     bounds = [f"{word} {value}" for word, value in stated if value is not None]
     return " ".join([_type(field.annotation), *([", ".join(bounds)] if bounds else [])])

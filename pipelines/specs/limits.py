@@ -64,13 +64,16 @@ def beyond(name: str, value: Any) -> str:
 
 def misfit(env: Any, algo: Any) -> str:
     """The reason why a method cannot learn in a task, as `field: text` with a field of the task, or nothing."""
-    from rhmc.hierarchy.regulation import MOST_TARGETS  # brings torch along, which a fault in a file can do without
+    from rhmc.envs import ENVS  # brings torch along, which a fault in a file can do without
+    from rhmc.hierarchy.coordinator import COORDINATORS
+    from rhmc.hierarchy.regulation import MOST_TARGETS
 
     field = "targets" if "targets" in type(env).model_fields else "agents"  # navigation has as many of both
     count = getattr(env, field)
     if getattr(algo, "regulator", "") == "exact" and count > MOST_TARGETS:
         return f"{field}: {count} is not allowed; the exact regulator takes at most {MOST_TARGETS} targets: use 'paper'"
-    return ""
+    chosen = COORDINATORS.get(getattr(getattr(algo, "coordinator", None), "method", ""))
+    return chosen.misfit(ENVS[env.kind].physics.spec(env)) if chosen else ""
 
 
 def absent(devices: Iterable[str]) -> list[str]:

@@ -1,14 +1,16 @@
-"""Methods and tasks of packages outside this project: who names them, what they register, and which runs need them.
+"""Methods, tasks and coordinators of packages outside this project: who names them, and which runs need them.
 
 A module is imported because a user names it: in a study's or a search's `imports`, as an entry point (`rhmc.methods`,
-`rhmc.tasks`) of a package that is installed, or in the variable `RHMC_IMPORTS`. A record, as of a run, a policy or a
-bundle, says which modules it needs. It is no user: what it names and nobody else does is not imported.
+`rhmc.tasks`, `rhmc.coordinators`) of a package that is installed, or in the variable `RHMC_IMPORTS`. A record, as of a
+run, a policy or a bundle, says which modules it needs. It is no user: what it names and nobody else does is not
+imported.
 """
 
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from functools import cache
 from importlib.metadata import entry_points
+from inspect import isclass, isfunction
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +22,23 @@ from pipelines.workspace.errors import InputError
 from pipelines.workspace.own_packages import NotImportedError, bring, load, load_taken, names, top_of
 from rhmc.algorithms import ALGORITHMS, Method
 from rhmc.envs import ENVS, EnvConfig, Task
+from rhmc.hierarchy import coordinator
+from rhmc.hierarchy.coordinator import COORDINATORS, Coordination
 from rhmc.learning.acting import ACTS_ON
 from rhmc.yardsticks import BOUNDS, OFFERS, POLICIES
 
 PROJECT = "rhmc"  # whose kinds are always there
-GROUPS = ("rhmc.methods", "rhmc.tasks")  # of entry points
+GROUPS = ("rhmc.methods", "rhmc.tasks", "rhmc.coordinators")  # of entry points
 VARIABLE = "RHMC_IMPORTS"  # names of modules, with commas between
-TABLES: dict[str, dict[str, Any]] = {"env": ENVS, "algo": ALGORITHMS}  # by section of a study
-WORDS = {"env": "task", "algo": "method"}
-FILLED: list[dict[str, Any]] = [ENVS, ALGORITHMS, ACTS_ON, OFFERS, POLICIES, BOUNDS]  # what a module may register in
+COORDINATOR = "coordinator"  # what the setting `coordinator.method` of a method chooses, if it has this setting
+TABLES: dict[str, dict[str, Any]] = {"env": ENVS, "algo": ALGORITHMS, COORDINATOR: COORDINATORS}  # sections first
+WORDS = {"env": "task", "algo": "method", COORDINATOR: "coordinator"}
+ENTRIES: dict[str, tuple[type[Any], str]] = {
+    "env": (Task, "rhmc.envs.Task"),
+    "algo": (Method, "rhmc.algorithms.Method"),
+    COORDINATOR: (Coordination, "rhmc.hierarchy.coordinator.Coordination"),
+}
+FILLED: list[dict[str, Any]] = [*TABLES.values(), ACTS_ON, OFFERS, POLICIES, BOUNDS]  # what a module may register in
 
 
 class UnnamedError(InputError):
@@ -49,10 +59,36 @@ def unknown(section: str, kind: Any) -> str:
     return f"{show(kind)} is not allowed; {choices(kind, configs(section))}{unusable}"
 
 
+def kinds_of(parts: Mapping[str, Any]) -> dict[str, Any]:
+    """The kinds of a setting's task and method, and its coordinator where the method is registered and chooses one.
+
+    Args:
+        parts: by section, as configurations or as a record has them. Not trusted.
+    """
+    kinds = {section: _value(part, "kind") for section, part in parts.items()}
+    if chooses(kinds.get("algo")) and (name := _value(_value(parts["algo"], COORDINATOR), "method")):
+        kinds[COORDINATOR] = name
+    return kinds
+
+
+def _value(part: Any, name: str) -> Any:
+    return part.get(name) if isinstance(part, dict) else getattr(part, name, None)
+
+
+def chooses(kind: Any) -> bool:
+    """True of a method whose settings name a coordinator of the table."""
+    return isinstance(kind, str) and kind in ALGORITHMS and issubclass(ALGORITHMS[kind].config, coordinator.Config)
+
+
+def page(entry: Any) -> str:
+    """The module that defines an entry of a table."""
+    return str((entry.build if isinstance(entry, Coordination) else entry.config).__module__)
+
+
 def pages(kinds: Mapping[str, Any]) -> tuple[str, ...]:
-    """The modules outside this project that define what runs of these kinds (by section) are."""
-    entries = [TABLES[section][kind] for section, kind in kinds.items() if kind in TABLES[section]]
-    found = {entry.config.__module__ for entry in entries}
+    """The modules outside this project that define what runs of these kinds (see `kinds_of`) are."""
+    known = [(section, kind) for section, kind in kinds.items() if isinstance(kind, str) and kind in TABLES[section]]
+    found = {page(TABLES[section][kind]) for section, kind in known}
     return tuple(sorted(module for module in found if top_of(module) != PROJECT))
 
 
@@ -108,19 +144,22 @@ def _unfit(known: Mapping[str, Collection[str]], module: str) -> Iterator[str]:
     """The faults of what was registered since; a module that was imported earlier has registered it then."""
     new = [(s, kind, entry) for s, table in TABLES.items() for kind, entry in table.items() if kind not in known[s]]
     for section, kind, entry in new:
-        what = f"registers the {WORDS[section]} {show(kind)}"
+        what, (shape, named) = f"registers the {WORDS[section]} {show(kind)}", ENTRIES[section]
         fields = getattr(getattr(entry, "config", None), "model_fields", {})
-        if not isinstance(entry, Task if section == "env" else Method):
-            yield f"{what}, which is no {'rhmc.envs.Task' if section == 'env' else 'rhmc.algorithms.Method'}"
+        if not isinstance(entry, shape):
+            yield f"{what}, which is no {named}"
         elif not simple(kind):
             yield f"{what}; a kind is named with letters, digits, '-' and '_' only"
+        elif section == COORDINATOR:
+            if not (isclass(entry.build) or isfunction(entry.build)):
+                yield f"{what}, whose `build` must be a class or a function: its module is part of what names a run"
         elif not issubclass(entry.config, EnvConfig if section == "env" else BaseModel):
             yield f"{what}, whose configuration is no {'rhmc.envs.EnvConfig' if section == 'env' else 'pydantic model'}"
         elif "kind" not in fields or fields["kind"].default != kind:
             yield f'{what}, whose configuration must have the field `kind: Literal["{kind}"] = "{kind}"`'
-    there = {top_of(entry.config.__module__) for table in TABLES.values() for entry in table.values()}
+    there = {top_of(page(entry)) for table in TABLES.values() for entry in table.values()}
     if not new and top_of(module) not in there:
-        yield "registers no method and no task"
+        yield "registers no method, no task and no coordinator"
 
 
 # Who names a module: what is installed, and the environment
@@ -166,11 +205,11 @@ def _load(module: str) -> None:
         raise UnnamedError(f"needs the module {module}: {error}") from error
 
 
-def require(kinds: Mapping[str, Any], stated: Any) -> None:
+def require(parts: Mapping[str, Any], stated: Any) -> None:
     """See that the kinds of a record are registered, and by the packages that it was made with.
 
     Args:
-        kinds: by section; what is no word is passed over.
+        parts: as `kinds_of` takes them; a kind that is no word is passed over.
         stated: the modules that the record says it needs, if it says any. Not trusted.
 
     Raises:
@@ -178,22 +217,25 @@ def require(kinds: Mapping[str, Any], stated: Any) -> None:
         InputError: one that was named cannot be imported.
     """
     wanted = [one for one in stated if isinstance(one, str)] if isinstance(stated, list | tuple) else []
-    unknown = [kind for section, kind in kinds.items() if isinstance(kind, str) and kind not in TABLES[section]]
-    if unknown:
+    if _unregistered(parts):
         discover()
         for module in wanted:
             if names(module):
                 _load(module)
-    if any(isinstance(kind, str) and kind not in TABLES[section] for section, kind in kinds.items()):
+    if _unregistered(parts):
         if text := unnamed(wanted):
             raise UnnamedError(text)
         return  # that a kind is unknown is said where the kinds are listed
-    here = {top_of(module) for module in pages(kinds)}
+    here = {top_of(module) for module in pages(kinds_of(parts))}
     if wanted and {top_of(module) for module in wanted} != here:
         raise UnnamedError(
             f"made with {', '.join(map(show, wanted))}, and its method and task are here of "
             f"{', '.join(sorted(here)) or PROJECT}"
         )
+
+
+def _unregistered(parts: Mapping[str, Any]) -> bool:
+    return any(isinstance(kind, str) and kind not in TABLES[section] for section, kind in kinds_of(parts).items())
 
 
 def unnamed(wanted: Iterable[str]) -> str:

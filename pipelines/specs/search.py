@@ -224,7 +224,7 @@ class Search(Frozen):
     def code(self, arm: str) -> str:
         """The code that decides the trials of an arm."""
         setting = self.arms[arm].setting
-        return code_id(setting.algo.kind, setting.env.kind)
+        return code_id(setting.algo.kind, setting.env.kind, setting.imports)
 
     def identity(self, arm: str) -> str:
         """12 hex digits over all that decides what the trials of an arm are and give, but for how many there are.

@@ -84,7 +84,7 @@ class Setting(Frozen):
     env: SerializeAsAny[EnvConfig]
     algo: Any
     trainer: trainer.Config
-    # What defines method and task outside this project; follows from their kinds, and names nothing.
+    # What defines method, task and coordinator outside this project; follows from their kinds, and names nothing.
     imports: tuple[str, ...] = Field((), exclude_if=lambda modules: not modules)
 
     @model_validator(mode="before")
@@ -94,9 +94,8 @@ class Setting(Frozen):
         if not isinstance(data, dict):
             return data
         parts = {name: data.get(name) for name in ("env", "algo")}
-        kinds = {k: v.get("kind") if isinstance(v, dict) else getattr(v, "kind", None) for k, v in parts.items()}
-        plugins.require(kinds, data.get(IMPORTS))
-        return data | {IMPORTS: plugins.pages(kinds)}
+        plugins.require(parts, data.get(IMPORTS))
+        return data | {IMPORTS: plugins.pages(plugins.kinds_of(parts))}
 
     @field_validator("env", "algo", mode="before")
     @classmethod

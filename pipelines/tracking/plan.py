@@ -55,7 +55,7 @@ def items(study: Study, commit: str = "", where: Host | None = None) -> list[Ite
         algorithm, task = spec.algo.kind, spec.env.kind
         params = {"method": algorithm} | {name: str(flat[name]) for name in varying if name in flat and name != KIND}
         params |= {"seed": str(spec.seed)}
-        code = modules(algorithm, task)
+        code = modules(algorithm, task, spec.imports)
         names = (run.arm, spec.seed, spec.id, combined(code.values()), algorithm, task, commit)
         env = spec.env.model_dump(mode="json")
         card = Card(*names, params, host=where or Host(), modules=code, env=env)

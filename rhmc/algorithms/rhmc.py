@@ -6,7 +6,7 @@ Departures, each a field of `Config`: `coordinator.gradient: counterfactual` and
 paper's gradients; `executor.method: qmix` instead of actors (`rhmc.hierarchy.mixing_executor`); `regulator: exact`
 beside Algorithm 1, with a `horizon`; an assignment may be held (`assignment_period`); Eq. 6 may charge for targets that
 nobody is assigned to (`unassigned`); both levels may learn from the team's reward (`reward` of either block), each on a
-scale of its own (`standardise`).
+scale of its own (`standardise`); `coordinator.method` puts another coordinator in the learned one's place.
 Eq. 7, 11 and 13 are read with standard signs; truncation bootstraps.
 """
 
@@ -18,6 +18,7 @@ from torch import Generator, Tensor
 
 from rhmc.algorithms.base import About, Method, register_method
 from rhmc.hierarchy import coordinator, executor
+from rhmc.hierarchy.coordinator import COORDINATORS
 from rhmc.hierarchy.mixing_executor import QMIXExecutor
 from rhmc.hierarchy.regulation import REGULATORS, Charges, executed
 from rhmc.learning import checkpoint
@@ -64,7 +65,10 @@ class RHMC:
         self.cfg, self.spec, self.rng = cfg, spec, rng
         self.regulate, self.reward_fn = REGULATORS[cfg.regulator], REWARDS[cfg.coordinator.reward]
         self.charges = Charges(cfg.alpha, cfg.unassigned)
-        self.coordinator = coordinator.Coordinator(cfg, spec, rng)
+        entry = COORDINATORS[cfg.coordinator.method]
+        if fault := entry.misfit(spec):
+            raise ValueError(fault)
+        self.coordinator = entry.build(cfg, spec, rng)
         self.executor = EXECUTORS[cfg.executor.method](cfg, spec, rng)
         self.low = Experience(cfg, cfg.executor.batch_size, rng)
         self.high = Replay(cfg.buffer_size, rng)
@@ -105,7 +109,7 @@ class RHMC:
         p["length"] = p["length"] + 1
         over = t.terminated | t.truncated | (p["length"] >= cfg.assignment_period)
         rows = {key: value[over] for key, value in self._period(t).items()}
-        self.coordinator.standardiser.update_rewards(rows["reward"])
+        self.coordinator.observe(rows)
         self.high.add(rows)
 
     def _period(self, t: Transition) -> Batch:

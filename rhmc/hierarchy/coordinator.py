@@ -3,12 +3,16 @@
 Two gradients for the binary assignment. `ddpg` is Eq. 9 through a straight-through relaxed Bernoulli: it follows the
 critic's slope at assignments of 0 and 1, where the critic was never asked between them. `counterfactual` replaces that
 slope by the finite difference of the critic per pair, Q(s, g with g_ij = 1) - Q(s, g with g_ij = 0).
+
+A table has the coordinators that `coordinator.method` chooses from: this one, `learned`, and those that packages add.
 """
 
-from typing import Literal
+from collections.abc import Callable
+from difflib import get_close_matches
+from typing import Any, Literal, NamedTuple, Protocol
 
 import torch
-from pydantic import Field
+from pydantic import Field, field_validator
 from torch import Generator, Tensor, nn
 from torch.nn.functional import mse_loss, softplus
 
@@ -18,12 +22,82 @@ from rhmc.learning.normalisation import Scale, Standardiser
 from rhmc.learning.settings import TargetNetworks
 from rhmc.networks.nets import ENCODERS, PairNet, Sizes, append
 from rhmc.networks.sampling import bernoulli, mix, relaxed_bernoulli
+from rhmc.registry import register
 from rhmc.types import Batch, Frozen, Obs, Spec, State
 
 
-class Settings(Frozen):
-    """The block `coordinator`; gamma is the paper's."""
+class HighLevel(Protocol):
+    """The interface of a coordinator to RHMC. Assignments are (B, N, M) float, 0 or 1.
 
+    Built as `build(cfg, spec, rng)`: the method's configuration, the sizes of the task, and the generator that samples
+    while learning. Network weights are drawn from torch's global generator.
+    """
+
+    def assign(self, obs: Obs, rng: Generator, *, explore: bool) -> Tensor:
+        """Assignment of each environment; draws come from this `rng`, and none are made without `explore`."""
+        ...
+
+    def observe(self, rows: Batch) -> None:
+        """Take in the rows of the assignment periods that ended now (`RHMC._period`); there may be none."""
+        ...
+
+    def update(self, rows: Batch) -> Batch:
+        """Learn from a batch of such rows: scalar tensors to log, or nothing."""
+        ...
+
+    def learners(self) -> Learners:
+        """Every network that learns, with its optimiser; none where nothing learns."""
+        ...
+
+    def state_dict(self) -> State:
+        """Everything that assigning and learning depend on, `rng` left out: it belongs to RHMC."""
+        ...
+
+    def load_state_dict(self, state: State) -> None:
+        """Continue from `state_dict`, bit for bit."""
+        ...
+
+
+def _fits(spec: Spec) -> str:
+    return ""
+
+
+class Coordination(NamedTuple):
+    """An entry of the table.
+
+    `misfit(spec)` is the reason why it cannot assign in a task of these sizes, as `field: text` with a field of the
+    task's configuration; empty if it can.
+    """
+
+    build: Callable[[Any, Spec, Generator], HighLevel]
+    misfit: Callable[[Spec], str] = _fits
+
+
+COORDINATORS: dict[str, Coordination] = {}  # by the name that `coordinator.method` has
+
+
+def register_coordinator(name: str, entry: Coordination) -> None:
+    """Make a coordinator known under the name that studies write; its page calls this once, at its end.
+
+    Raises:
+        ValueError: another coordinator has the name.
+    """
+    register(COORDINATORS, name, entry)
+
+
+def _list(schema: dict[str, Any]) -> None:
+    """The names that are there now, for a reader of the settings."""
+    schema["enum"] = list(COORDINATORS)
+
+
+class Settings(Frozen):
+    """The block `coordinator`; gamma is the paper's. All but `method` are settings of the one that learns."""
+
+    method: str = Field(
+        "learned",
+        json_schema_extra=_list,
+        description="who assigns: the coordinator that learns, or one of a package (`register_coordinator`)",
+    )
     gradient: Literal["ddpg", "counterfactual"] = Field("ddpg", description="gradient of the assignment policy")
     reward: Literal["assigned", "team"] = Field(
         "assigned", description="reward of the coordinator: Eq. 6, or the team's reward, which knows no regulation"
@@ -35,6 +109,15 @@ class Settings(Frozen):
     assignment_epsilon: float = Field(0.05, ge=0, le=1, description="share of pairs assigned at random while exploring")
     batch_size: int = Field(256, ge=1, description="rows of an update")
     update_every: int = Field(1, ge=1, description="updates of the executors for each one of the coordinator")
+
+    @field_validator("method")
+    @classmethod
+    def _is_there(cls, name: str) -> str:
+        if name not in COORDINATORS:
+            near = get_close_matches(name, COORDINATORS, 1, 0.5)
+            meant = f"; did you mean '{near[0]}'?" if near else ""
+            raise ValueError(f"'{name}' is not allowed; allowed: {', '.join(COORDINATORS)}{meant}")
+        return name
 
 
 class Config(TargetNetworks):
@@ -63,6 +146,10 @@ class Coordinator:
         if explore:
             return bernoulli(mix(logits.sigmoid(), 0.5, self.cfg.assignment_epsilon), rng)
         return (logits > 0).float()
+
+    def observe(self, rows: Batch) -> None:
+        """Count in the rewards of periods that ended."""
+        self.standardiser.update_rewards(rows["reward"])
 
     def update(self, rows: Batch) -> Batch:
         """One step of the critic (Eq. 7) and one of the actor (Eq. 9).
@@ -124,3 +211,6 @@ def differences(critic: PairNet, obs: Obs, assignment: Tensor) -> Tensor:
     given = append(obs, pair=assignment.unsqueeze(-1))
     change = critic.flips(given) - critic(given).sum((1, 2, 3)).view(-1, 1, 1)
     return change * (1 - 2 * assignment)
+
+
+register_coordinator("learned", Coordination(Coordinator))

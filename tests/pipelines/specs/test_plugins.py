@@ -68,7 +68,7 @@ def test_beside_the_study_goes_before_the_current_directory_and_installed_before
     Path("studies/json/__init__.py").write_text("raise ValueError('not the one of Python')\n")
     load()
     assert faults(STUDY.replace("[bandits]", "[json]")) == [
-        "studies/x.yaml:2:11: imports.0: 'json': registers no method and no task"
+        "studies/x.yaml:2:11: imports.0: 'json': registers no method, no task and no coordinator"
     ]
 
 
@@ -132,7 +132,7 @@ def test_an_entry_point_does_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
         ("[ending]", "2:11: imports.0: 'ending': cannot be imported: SystemExit: 3 ({here}/studies/ending.py:2)"),
         ("[clashing]", "2:11: imports.0: 'clashing': cannot be imported: ValueError: 'iql' is registered already; "
                        "choose another kind ({here}/studies/clashing.py:4)"),
-        ("[idle]", "2:11: imports.0: 'idle': registers no method and no task"),
+        ("[idle]", "2:11: imports.0: 'idle': registers no method, no task and no coordinator"),
         ("[misfit]", "2:11: imports.0: 'misfit': registers the task 'misfit', whose configuration is no "
                      "rhmc.envs.EnvConfig"),
         ("[rhmc.algorithms]", "2:11: imports.0: 'rhmc.algorithms': is of this project, whose methods and tasks are "
@@ -222,7 +222,7 @@ def test_the_variable_names_a_package_for_every_record(monkeypatch: pytest.Monke
     write(Path())
     Path("bandits/__init__.py").write_text("")  # the record's modules register
     monkeypatch.setenv("RHMC_IMPORTS", "bandits")
-    with pytest.raises(InputError, match=r"RHMC_IMPORTS: 'bandits': registers no method and no task"):
+    with pytest.raises(InputError, match=r"RHMC_IMPORTS: 'bandits': registers no method, no task and no coordinator"):
         RunSpec.model_validate(record())
     monkeypatch.setenv("RHMC_IMPORTS", "bandits.methods, bandits.tasks")
     assert RunSpec.model_validate(record()).imports == ("bandits.methods", "bandits.tasks")
