@@ -20,7 +20,7 @@ project, author, html_title = "rhmc", "the rhmc contributors", "rhmc"
 root_doc = "README"
 whole = not tags.has("pages")  # type: ignore[name-defined]  # noqa: F821  # Sphinx gives this module its tags
 extensions = ["myst_parser", "sphinx.ext.napoleon", *(["autoapi.extension"] if whole else [])]
-include_patterns = ["*.md", "docs/*.md", "benchmarks/README.md", f"{REFERENCE}/**"]
+include_patterns = ["*.md", "docs/*.md", "benchmarks/README.md", "examples/*/README.md", f"{REFERENCE}/**"]
 include_patterns += [f"{RESULTS}/*.md", f"{RESULTS}/tables/*.md", f"{RESULTS}/measured/*.md"]
 exclude_patterns = [".*", "work", "tests", "studies", "rhmc", "pipelines", "reports", "build/site", "build/doctrees"]
 html_theme = "furo"
@@ -43,6 +43,8 @@ CONTENTS = {
         "docs/walkthrough",
         "docs/search",
         "docs/extending",
+        "examples/hungarian/README",
+        "examples/warehouse/README",
         "docs/pettingzoo",
         "docs/scaling",
     ],

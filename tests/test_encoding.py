@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-FILES = sorted(path for name in ("rhmc", "pipelines", "reports", "benchmarks") for path in (ROOT / name).rglob("*.py"))
+PARTS = ("rhmc", "pipelines", "reports", "benchmarks", "examples")
+FILES = sorted(path for name in PARTS for path in (ROOT / name).rglob("*.py"))
 TEXT = ("read_text", "write_text", "fdopen", "open", "NamedTemporaryFile", "TemporaryFile")
 
 
