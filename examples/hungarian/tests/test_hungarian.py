@@ -1,6 +1,7 @@
 """RHMC with the coordinator Hungarian does what every method has to do."""
 
 import hungarian.coordinator  # noqa: F401  # registers itself
+
 from pipelines.conformance.methods import check_method
 
 

@@ -1,6 +1,7 @@
 """The task Warehouse does what every task has to do, and every method that fits trains in it."""
 
 import warehouse.task
+
 from pipelines.conformance.tasks import check_task
 
 

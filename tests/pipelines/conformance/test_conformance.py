@@ -75,6 +75,19 @@ def forgets(made: Any) -> None:
     made.load_state_dict = lambda state: load(state | {"rng": torch.Generator().manual_seed(0).get_state()})
 
 
+def remembers_beside_its_carry(made: Any) -> None:
+    """What acting remembers from step to step is in no checkpoint, so that a resume loses it."""
+    act = made.act
+    made.acted = 0
+
+    def remembering(*args: Any, explore: bool) -> Any:
+        action, carry, extra = act(*args, explore=explore)
+        made.acted += explore
+        return (action + explore * made.acted) % 3, carry, extra
+
+    made.act = remembering
+
+
 def ignores_its_generator(made: Any) -> None:
     act = made.act
     made.act = lambda obs, carry, rng, *, explore: act(obs, carry, torch.Generator().manual_seed(0), explore=explore)
@@ -117,6 +130,7 @@ def is_not_finite(made: Any) -> None:
     [
         (leaks, "evaluation leaves no trace", "algorithm"),
         (forgets, "continues from any point bit for bit", "algorithm.rng: "),
+        (remembers_beside_its_carry, "continues from any point bit for bit", "after a resume"),
         (ignores_its_generator, "exploring is decided by the generator", "nothing explores"),
         (draws_when_greedy, "acts within the task", "greedy acting draws from the generator"),
         (acts_outside, "acts within the task", "an action is outside 0 to"),
