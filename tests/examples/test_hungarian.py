@@ -11,6 +11,7 @@ from torch import Tensor
 from pipelines.conformance.checks import seeded
 from pipelines.specs.identity import code_id, modules, present
 from pipelines.specs.study import RunSpec, Study, StudyError
+from pipelines.tracking.plan import items
 from pipelines.workspace.errors import InputError
 from rhmc.envs import coverage, make_env, navigation
 from rhmc.hierarchy.coordinator import COORDINATORS, Coordination, register_coordinator
@@ -85,12 +86,14 @@ def test_its_study_has_no_fault_and_both_arms_train(variant: str | None) -> None
 
 
 def test_a_run_is_named_by_the_package_of_its_coordinator_and_others_are_not() -> None:
-    before = code_id("rhmc", "coverage")
-    learned, own = (run.spec for run in Study.load(FILE).runs() if run.spec.seed == 0)
+    before, study = code_id("rhmc", "coverage"), Study.load(FILE)
+    learned, own = (run.spec for run in study.runs() if run.spec.seed == 0)
     assert (learned.imports, own.imports) == ((), ("hungarian.coordinator",))
     assert code_id("rhmc", "coverage", learned.imports) == before
     assert code_id("rhmc", "coverage", own.imports) != before
-    assert {before, code_id("rhmc", "coverage", own.imports)} <= present()
+    codes = [item.card.fingerprint for item in items(study) if item.spec.seed == 0]
+    assert codes == [before, code_id("rhmc", "coverage", own.imports)]
+    assert {*codes} <= present()
     found = modules("rhmc", "coverage", own.imports)
     assert [name for name in found if name.startswith("hungarian")] == ["hungarian.coordinator"]
     assert RunSpec.model_validate_json(own.canonical()) == own
