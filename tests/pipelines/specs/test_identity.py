@@ -23,6 +23,7 @@ from pipelines.specs.study import RunSpec
 from pipelines.specs.syntax import Code
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import ENVS
+from rhmc.hierarchy.coordinator import COORDINATORS
 from rhmc.training.trainer import Config as TrainerConfig
 
 ROOT = Path(__file__).parents[3]
@@ -392,7 +393,7 @@ def other(field: FieldInfo) -> list[Any]:
     if isinstance(default, float):
         return [default / 2, default + 0.25]
     if isinstance(default, str):
-        return ["cuda"]
+        return ["cuda", "another"]
     if isinstance(default, tuple):
         return [default[::-1]]
     return [1, 2, 0.5]
@@ -412,7 +413,10 @@ BESIDE = {  # what a value needs
 
 
 @pytest.mark.parametrize(("section", "kind", "field"), FIELDS)
-def test_another_value_of_any_field_is_another_run(section: str, kind: str, field: str) -> None:
+def test_another_value_of_any_field_is_another_run(
+    section: str, kind: str, field: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(COORDINATORS, "another", COORDINATORS["learned"])
     config = next(c for s, k, c in CONFIGS if (s, k) == (section, kind))
     beside = {} if section != "algo" or kind != "rhmc" else BESIDE.get(field, {})
     tried = []
