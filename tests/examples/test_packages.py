@@ -11,7 +11,7 @@ from tests.examples.conftest import EXAMPLES
 
 EXAMPLE = "."
 ROOT = EXAMPLES.parent
-TAKEN = {"rhmc", "torch", "pydantic", "scipy"}
+TAKEN = {"rhmc", "torch", "pydantic", "numpy", "scipy"}
 
 
 def test_the_page_has_the_lines_as_they_are_counted() -> None:
@@ -29,7 +29,8 @@ def test_they_take_what_a_user_has() -> None:
             tree = ast.parse(path.read_text(encoding="utf-8"))
             named = [one for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for one in node.names]
             tops = {str(node.module).split(".")[0] for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
-            assert tops <= {*TAKEN, package, "collections", "typing"}
+            tops |= {one.name for node in ast.walk(tree) if isinstance(node, ast.Import) for one in node.names}
+            assert tops <= {*TAKEN, package, "collections", "sys", "typing"}
             assert not [one.name for one in named if one.name.startswith("_")]
 
 

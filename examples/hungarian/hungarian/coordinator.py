@@ -8,6 +8,7 @@ coordinator knows no more than a learned one.
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import torch
 from scipy.optimize import linear_sum_assignment
 from torch import Generator, Tensor
@@ -76,10 +77,9 @@ def cheapest(cost: Tensor) -> Tensor:
     """
     batch, agents, targets = cost.shape
     rows = cost.repeat(1, -(-targets // agents), 1).cpu().numpy()  # an agent stands for each target that it may have
+    row, target = torch.from_numpy(np.array([linear_sum_assignment(table) for table in rows])).unbind(1)
     assignment = torch.zeros(batch, agents, targets)
-    for own, table in zip(assignment, rows, strict=True):
-        row, target = linear_sum_assignment(table)
-        own[row % agents, target] = 1
+    assignment[torch.arange(batch).unsqueeze(-1), row % agents, target] = 1
     return assignment.to(cost.device)
 
 
