@@ -180,7 +180,7 @@ def shown_in(gif: bytes) -> str:
     try:
         with Image.open(io.BytesIO(gif)) as image:
             return str(json.loads(image.info.get("comment", b"{}"))["run"])
-    except (OSError, SyntaxError, ValueError, TypeError, KeyError):  # of another program, or no picture at all
+    except (*embed.UNREADABLE, TypeError, KeyError):  # of another program, or no picture at all
         return ""
 
 

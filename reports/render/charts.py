@@ -23,7 +23,7 @@ FINE = 1000  # units of an axis at least: a point is at most that far off
 PALE = "#9A9A9A"
 GREY = Look(PALE, "-", "")  # of arms between the best and the worst, where there are many
 DASHES: Mapping[str, str] = {"-": "", "--": "6 3", ":": "1.5 2.5", "-.": "7 2.5 1.5 2.5"}
-TALL, LESS, NAME = 22.0, 18.0, 1.3  # rem: height of a plot, of one of two, of a name beside it
+TALL, LESS, SMALL, NAME = 22.0, 18.0, 12.0, 1.3  # rem: height of a plot, of one of two, of many; of a name beside it
 CLOCKS = ((3600, "h"), (60, "min"), (1, "s"))
 Tick = tuple[float, str]  # a place in percent, and its words
 
@@ -34,7 +34,7 @@ class Scale(NamedTuple):
     steps: int  # environment steps of a unit to the right
     end: int  # units of the whole axis
     fine: int  # units upwards of a return of 1
-    digits: int  # after the point of a return
+    digits: int  # after the point of a final return; as many as `fine` has zeros of what is read off a curve
 
     def x(self, step: float) -> int:
         """Steps in units."""
@@ -234,7 +234,7 @@ def _panels(
         entries = [_line_entry(line, scale) for line in lines]
         entries += [_entry(results, study, key, arm, looks[key], scale) for key, arm in group.arms.items()]
         entries.sort(key=lambda entry: -entry.height)
-        made.append(Frame(group.title or f"all {len(group.arms)} arms", drawn, [_plot("", heights, entries, scale, 0)]))
+        made.append(Frame(group.title or f"all {len(group.arms)} arms", drawn, [_plot("", heights, entries, scale, SMALL)]))
     return made
 
 
@@ -305,16 +305,18 @@ def _line_entry(line: Line, scale: Scale) -> Entry:
 
 
 def _plot(title: str, heights: tuple[float, float], entries: Sequence[Entry], scale: Scale, least: float) -> Plot:
-    """Axes with their names, which stand as near to their lines as others let them. least: rem of height."""
+    """Axes with their names, which stand as near to their lines as others let them; below it, where it is small.
+
+    least: rem of height.
+    """
     low, high = heights
     top, bottom = scale.y(high), scale.y(low)
 
     def place(value: float) -> float:
         return 100 * (high - value) / (high - low)
 
-    tall = max(least, NAME * len(entries))
-    wanted = [place(entry.height) for entry in entries]
-    at = figures.spread(wanted, 100 * NAME / tall, 0.0, 100.0) if least else wanted
+    tall = least if least == SMALL else max(least, NAME * len(entries))
+    at = figures.spread([place(entry.height) for entry in entries], 100 * NAME / tall, 0.0, 100.0)
     names = [entry.name._replace(end=place(entry.end), at=y) for entry, y in zip(entries, at, strict=True)]
     ticks = _ticks(low, high)
     grid = "".join(f"M0 {scale.y(y)}h{scale.end}" for y in ticks)
