@@ -23,7 +23,8 @@ from reports.render.tables import NONE, Table
 TEMPLATE = "page.html.j2"
 NUMBER = re.compile(r"^[+<\s]*(-?\d[\d,]*(?:\.\d+)?)\s*([kM]?)\b")
 SHOWN = 2 / 3  # of a figure's pixels: all words on the page are then of one size
-LEGIBLE = 0.58  # of a figure's pixels: letters of 7 points at 160 dots an inch are then 9 pixels high
+LEGIBLE = 0.63  # of a figure's pixels: letters of 6.5 points at 160 dots an inch are then 9 pixels high
+FRAMED = 0.75  # the same of an animation's pixels, whose letters are 12 high
 FILES: Mapping[str, str] = {"PDF": "pdf", "numbers": "csv"}
 LONG = 66  # rows of a table that are shown at once: the pairs of twelve arms
 FILTERED = 8  # rows of a table above which it has a field for words; a script makes it
@@ -167,7 +168,7 @@ def episode(task: str, gif: bytes, folder: str, whose: str = "") -> Plate:
         return Plate(*about, "", 0, 0, 0, 0, "rhmc render", [], fault)
     address, (width, height) = embed.animation(gif)
     files = [("GIF", f"{folder}/{quote(f'episode_{task}.gif')}")] if folder else []
-    return Plate(*about, address, width, height, width, round(width * SHOWN), "rhmc render", files)
+    return Plate(*about, address, width, height, width, round(width * FRAMED), "rhmc render", files)
 
 
 def anchor(task: str) -> str:

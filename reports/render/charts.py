@@ -203,7 +203,7 @@ def _whole(results: Results, spec: Curves, curves: Mapping[str, pd.DataFrame]) -
     low, high = _range(curves, [line.height for line in lines])
     scale = _scale(curves, [(low, high)])
     drawn = [_flat(line, scale) for line in lines]
-    drawn += [_curve(results, spec.study, arm, arm, looks[arm], scale) for arm in reversed(curves)]
+    drawn += [_curve(results, spec.study, arm, arm, looks[arm], scale) for arm in reversed(list(curves))]
     ours = [_entry(results, spec.study, arm, arm, looks[arm], scale) for arm in curves]
     theirs = [_line_entry(line, scale) for line in lines]
     late = figures.late_part(curves, [line.height for line in lines])
@@ -230,11 +230,15 @@ def _panels(
         looks = {key: look(key, names) if len(names) <= panels.MOST else ends.get(key, GREY) for key in group.arms}
         lines = _yardsticks(group.yardsticks)
         drawn = [_flat(line, scale) for line in lines]
-        drawn += [_curve(results, study, key, arm, looks[key], scale) for key, arm in reversed(group.arms.items())]
+        drawn += [
+            _curve(results, study, key, arm, looks[key], scale) for key, arm in reversed(list(group.arms.items()))
+        ]
         entries = [_line_entry(line, scale) for line in lines]
         entries += [_entry(results, study, key, arm, looks[key], scale) for key, arm in group.arms.items()]
         entries.sort(key=lambda entry: -entry.height)
-        made.append(Frame(group.title or f"all {len(group.arms)} arms", drawn, [_plot("", heights, entries, scale, SMALL)]))
+        made.append(
+            Frame(group.title or f"all {len(group.arms)} arms", drawn, [_plot("", heights, entries, scale, SMALL)])
+        )
     return made
 
 

@@ -58,7 +58,7 @@ def test_paths_hold_the_means_the_bands_and_the_seeds(tables: Path) -> None:
     assert values(band[: len(rows)]) == pytest.approx(rows["high"].tolist(), abs=close)
     assert values(band[: len(rows) - 1 : -1]) == pytest.approx(rows["low"].tolist(), abs=close)
     for seed, one in enumerate(curve.seeds):
-        own = results.curve("ablation", "full").query("seed == @seed")["value"].tolist()
+        own = results.curve("ablation", "full").set_index("seed").loc[seed, "value"].tolist()
         assert values(points(one)) == pytest.approx(own, abs=close)
     assert curve.pace == pytest.approx(1.5 / 150_000 * scale.steps)
     assert chart.seconds == pytest.approx(1.5)
