@@ -230,15 +230,13 @@ def _panels(
         looks = {key: look(key, names) if len(names) <= panels.MOST else ends.get(key, GREY) for key in group.arms}
         lines = _yardsticks(group.yardsticks)
         drawn = [_flat(line, scale) for line in lines]
-        drawn += [
-            _curve(results, study, key, arm, looks[key], scale) for key, arm in reversed(list(group.arms.items()))
-        ]
+        arms = list(group.arms.items())
+        drawn += [_curve(results, study, key, arm, looks[key], scale) for key, arm in reversed(arms)]
         entries = [_line_entry(line, scale) for line in lines]
-        entries += [_entry(results, study, key, arm, looks[key], scale) for key, arm in group.arms.items()]
+        entries += [_entry(results, study, key, arm, looks[key], scale) for key, arm in arms]
         entries.sort(key=lambda entry: -entry.height)
-        made.append(
-            Frame(group.title or f"all {len(group.arms)} arms", drawn, [_plot("", heights, entries, scale, SMALL)])
-        )
+        plot = _plot("", heights, entries, scale, SMALL)
+        made.append(Frame(group.title or f"all {len(arms)} arms", drawn, [plot]))
     return made
 
 

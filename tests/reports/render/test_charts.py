@@ -9,6 +9,7 @@ from reports.data.frame import load
 from reports.data.paper import read
 from reports.render import charts
 from tests.reports.factory import noisy, study, write, yardsticks
+from tests.reports.render.test_panels import SPEC, of_two
 
 
 def points(path: str) -> list[tuple[int, int]]:
@@ -79,3 +80,25 @@ def test_without_times_there_is_no_axis_of_them(tables: Path) -> None:
     chart = charts.chart(load(tables, "quick"), read().figures["fig_10"], "fig_10")
     assert chart is not None
     assert (chart.seconds, chart.times) == (0, [])
+
+
+def test_each_task_has_a_frame_with_the_names_in_their_order(tmp_path: Path) -> None:
+    chart = charts.chart(of_two(tmp_path), SPEC, "curves_reach")
+    assert chart is not None
+    assert [frame.title.partition(",")[2] for frame in chart.frames] == [
+        " 2 sensors x 5 targets",
+        " 4 sensors x 5 targets",
+    ]
+    names = [[(name.key, name.value) for name in frame.plots[0].names] for frame in chart.frames]
+    best = [("free heading (bound)", "66.4"), ("planner", "53.9"), ("RHMC", "45.0"), ("IQL", "44.0")]
+    assert names[0] == best
+    assert list(chart.places) == ["RHMC, agents=2", "IQL, agents=2", "RHMC, agents=4", "IQL, agents=4"]
+
+
+def test_of_many_arms_those_between_the_best_and_the_worst_are_grey(tmp_path: Path) -> None:
+    arms = {f"part {n % 2}, horizon {n}": noisy(50 + n) for n in range(14)}
+    chart = charts.chart(load(write(tmp_path, study("reach", arms, points=2)), "quick"), SPEC, "curves_reach")
+    assert chart is not None
+    coloured = {curve.key for frame in chart.frames for curve in frame.curves if curve.seeds and not curve.pale}
+    assert coloured == {"horizon 0", "horizon 1", "horizon 12", "horizon 13"}
+    assert len(chart.places) == 14
