@@ -91,6 +91,7 @@ def test_every_figure_has_words_for_those_who_do_not_see_it(made: Path, read: Re
     drawn = [found["aria-label"] for found in read.of("svg") if found.get("role") == "img"]
     assert sum(label.startswith("Line chart of return") for label in drawn) == 2
     assert all(len(label) > 30 for label in drawn)
+    assert all(figure.get("aria-label") for figure in read.of("figure"))
     for image in images:
         assert len(image["alt"]) > 30
         assert int(image["width"]) > int(image["height"]) / 3 > 0
