@@ -40,13 +40,14 @@ class Panel(NamedTuple):
     scenes: Sequence[Scene]
 
 
-def gif(env: EnvConfig, panels: Sequence[Panel], frames: int, milliseconds: int) -> bytes:
+def gif(env: EnvConfig, panels: Sequence[Panel], frames: int, milliseconds: int, note: str = "") -> bytes:
     """The panels side by side as a GIF.
 
     Args:
         env: the task of all panels, whose episodes are equally long.
         frames: at most so many; the steps between are left out, the last one never.
         milliseconds: of each frame.
+        note: kept in the file, as a comment that no viewer shows.
 
     Raises:
         InputError: the task offers no painter.
@@ -61,7 +62,8 @@ def gif(env: EnvConfig, panels: Sequence[Panel], frames: int, milliseconds: int)
     flat = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
     out = BytesIO()
     times = [milliseconds] * (len(flat) - 1) + [max(PAUSE, milliseconds)]
-    flat[0].save(out, "GIF", save_all=True, append_images=flat[1:], duration=times, loop=0, optimize=False)
+    comment = {"comment": note.encode()} if note else {}
+    flat[0].save(out, "GIF", save_all=True, append_images=flat[1:], duration=times, loop=0, optimize=False, **comment)
     return out.getvalue()
 
 

@@ -1,5 +1,6 @@
 """One episode of a policy as a small animation, beside policies without learning and a bound if wanted."""
 
+import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -111,7 +112,9 @@ def _words(name: str, value: float) -> str:
     return f"return {value:.1f}" if name == "return" else f"{name.replace('_', ' ')} {value:.2f}"
 
 
-def episode_gif(saved: policy.Saved, episode: int = 0, beside: str | None = None, frames: int = FRAMES) -> bytes:
+def episode_gif(
+    saved: policy.Saved, episode: int = 0, beside: str | None = None, frames: int = FRAMES, note: str = ""
+) -> bytes:
     """An episode of a trained policy as a GIF.
 
     Args:
@@ -119,6 +122,7 @@ def episode_gif(saved: policy.Saved, episode: int = 0, beside: str | None = None
         episode: names the start and the target motion.
         beside: also policies without learning, or `FREE`, in the same episode: names with commas between.
         frames: at most so many.
+        note: kept in the file.
 
     Raises:
         InputError: no such policy, or a state that this code cannot load.
@@ -131,7 +135,7 @@ def episode_gif(saved: policy.Saved, episode: int = 0, beside: str | None = None
     except ValueError as error:
         raise InputError(f"the policy cannot be used: {error}") from error
     own = f"{saved.spec.algo.kind}, seed {saved.spec.seed}, episode {episode}"
-    return gif(env, [Panel(own, play(env, trained(actor), episode)), *others], frames, MILLISECONDS)
+    return gif(env, [Panel(own, play(env, trained(actor), episode)), *others], frames, MILLISECONDS, note)
 
 
 def render(
@@ -152,7 +156,8 @@ def render(
         raise InputError(f"--out: {out} is a folder" if out.is_dir() else f"--out: {out.parent} is no folder")
     saved = what if isinstance(what, policy.Saved) else _saved(what, home)
     torch.set_num_threads(saved.spec.trainer.threads)  # the actions of larger layers depend on it
-    write(out, episode_gif(saved, episode, beside, frames))
+    note = json.dumps({"run": saved.spec.id, "episode": episode})  # the report's page says whose episode it shows
+    write(out, episode_gif(saved, episode, beside, frames, note))
     return out
 
 

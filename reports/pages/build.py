@@ -5,7 +5,7 @@ import json
 import os
 import shutil
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,7 +16,7 @@ from reports.claims.verdicts import Claim
 from reports.data.frame import TableError, load
 from reports.data.paper import PaperError, read
 from reports.pages import content, embed, index, page
-from reports.pages.gallery import Picture, reason
+from reports.pages.gallery import ARMS, Picture, reason
 from reports.pages.metrics import metrics
 from reports.pages.report import Report, single, whole
 from reports.render.canvas import save, write_csv
@@ -134,27 +134,34 @@ def _write(report: Report, folder: Path) -> Report:
     if report.claims:
         _write_claims(report.claims, folder)
         _write_text(folder / METRICS, json.dumps(metrics(report), indent=1, ensure_ascii=False) + "\n")
-    report = report._replace(pictures=[_saved(picture, pictures) for picture in report.pictures])
+    saved: list[Picture] = []
+    for picture in report.pictures:
+        saved.append(_saved(picture, pictures, {one.name for one in saved if one.chart}))
+    report = report._replace(pictures=saved)
     _write_text(folder / "index.md", "\n".join(index.page(report)) + "\n")
     _write_text(folder / "index.html", page.render(content.of(report)))
     return report
 
 
-def _saved(picture: Picture, folder: Path) -> Picture:
-    """Write the files of a figure. One that cannot be drawn has its numbers alone, and says why."""
+def _saved(picture: Picture, folder: Path, charts: Collection[str]) -> Picture:
+    """Write the files of a figure. One that cannot be drawn has its numbers alone, and says why.
+
+    charts: figures that the page has as charts: these show the same arm by arm, so that is no picture there.
+    """
     if picture.drawing is None:
         return picture
     try:
         lost = save(picture.drawing, folder, picture.name)
-        drawn = svg(picture.drawing.figure)
+        charted = picture.chart or (picture.name.endswith(ARMS) and picture.name.removesuffix(ARMS) in charts)
+        drawn = "" if charted else svg(picture.drawing.figure)
     except Exception as error:
         if isinstance(error, OSError):  # a full disk is no fault of the figure
             raise
         for kind in ("png", "pdf"):
             (folder / f"{picture.name}.{kind}").unlink(missing_ok=True)
-        return picture._replace(fault=reason(error))
+        return picture._replace(fault=reason(error), chart=None)
     caption = f"{picture.caption} {LOST}" if lost else picture.caption
-    shown = embed.figure(drawn, (folder / f"{picture.name}.png").read_bytes())
+    shown = embed.figure(drawn, (folder / f"{picture.name}.png").read_bytes()) if drawn else None
     return picture._replace(caption=caption, shown=shown)
 
 

@@ -1,15 +1,16 @@
 """The content of the page: its parts in their order, by the names of its template."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from reports.analyses import searches
 from reports.claims import verdicts as rules
 from reports.data.escaping import stem, words
 from reports.data.frame import Results, mixed
 from reports.pages import answer, forest, page, sheets
+from reports.pages.gallery import ARMS, Picture
 from reports.pages.report import Report, definitions, question
-from reports.render.tables import SPAN, Table
+from reports.render.tables import SPAN, Table, joined
 
 DRAWN = "rhmc drawings"
 PAIRS = "pairs_"  # they carry the answer of a study's own report
@@ -38,7 +39,7 @@ def of(report: Report) -> Mapping[str, Any]:
         "aside": words(results.set_aside) if report.paper else "",
         "provenance": page.provenance(results),
         "made": page.grid("provenance", report.tables["provenance"]),
-        "runs": page.grid("runs", runs),
+        "runs": page.grid("runs", runs, _links(report)),
         "counted": "runs" if set(results.runs["study"]) <= set(results.studies) else "runs, with yardsticks",
         "ids": [f"run-{stem(run)}" if first else "" for run, first in _first_seen(runs)],
         "foot": f"Built from the exported tables of profile {results.profile}; the same tables give the same page.",
@@ -117,19 +118,65 @@ def _section(report: Report, name: str, title: str, study: str, names: Sequence[
     results = report.results
     known = study in (*results.studies, *results.searches)
     made = rules.command(study, results.profile) if study in results.studies else DRAWN
-    plates = {p.name: page.plate(p, p.behind or made.partition(" && ")[0]) for p in report.pictures if p.study == study}
+    own = {p.name: p for p in report.pictures if p.study == study}
+    beside = {name for name, p in own.items() if _in_chart(name, own) and not p.fault}  # files, and not on the page
+    plates = {
+        name: page.plate(p, p.behind or made.partition(" && ")[0], arms=f"{name}{ARMS}" in beside)
+        for name, p in own.items()
+        if name not in beside
+    }
     if name == METHOD:
-        episodes = [page.episode(task, gif, report.tables_at) for task, gif in results.episodes.items()]
+        gifs = results.episodes.items()
+        episodes = [page.episode(task, gif, report.tables_at, _whose(results, gif)) for task, gif in gifs]
         plates |= {plate.name: plate for plate in episodes}
-    grids = {key: page.grid(key, report.tables[key]) for key in names if key in report.tables}
+    links = _links(report)
+    grids = {key: page.grid(key, report.tables[key], links) for key in names if key in report.tables}
     folded = MORE if report.paper else tuple(kind for kind in MORE if kind != PAIRS)
     parts = *_parted(plates, folded), *_parted(grids, folded)
     return page.Section(name, title, question(results, study) if known else "", *parts)
 
 
+def _links(report: Report) -> page.Links:
+    """Where the page shows each arm."""
+    charts = [(p.study, p.chart.places) for p in report.pictures if p.chart]
+    return page.Links(
+        {(study, arm): place for study, places in charts for arm, place in places.items()},
+        {
+            (row.study, row.arm, row.run): page.anchor(task)
+            for task, gif in report.results.episodes.items()
+            for row in _shown_in(report.results, gif)
+        },
+    )
+
+
+class Shown(NamedTuple):
+    """A run whose policy an animation shows; it may stand in several studies."""
+
+    study: str
+    arm: str
+    seed: int
+    run: str
+
+
+def _shown_in(results: Results, gif: bytes) -> list[Shown]:
+    rows = results.runs[(results.runs["run"] == page.shown_in(gif)) & results.runs["study"].isin(results.studies)]
+    return [Shown(*row) for row in rows[list(Shown._fields)].itertuples(index=False)]
+
+
+def _whose(results: Results, gif: bytes) -> str:
+    """The policy of an animation, in words."""
+    return joined(f"study {row.study}, arm {row.arm}, seed {row.seed}" for row in _shown_in(results, gif))
+
+
+def _in_chart(name: str, pictures: Mapping[str, Picture]) -> bool:
+    """True of the figure arm by arm of one that is a chart."""
+    whole = pictures.get(name.removesuffix(ARMS)) if name.endswith(ARMS) else None
+    return whole is not None and whole.chart is not None
+
+
 def _parted(found: Mapping[str, Part], folded: tuple[str, ...]) -> tuple[list[Part], list[Part]]:
     """The parts that are shown at once, and those that are folded away: others, which look at the same runs anew."""
-    away = {key for key in found if key.startswith(folded) or key.endswith("_arms")}
+    away = {key for key in found if key.startswith(folded) or key.endswith(ARMS)}
     return [x for key, x in found.items() if key not in away], [x for key, x in found.items() if key in away]
 
 

@@ -12,6 +12,7 @@ SMALL = 30_000  # bytes of an SVG below which pixels are not tried
 LOSSLESS = {"lossless": True, "quality": 80, "method": 4}
 PLAIN = " '=:/;,()[]{}!*+-.~_?@$&"  # of an SVG, as they are in an address between double quotes
 GIF = "image/gif"
+UNREADABLE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)  # what Pillow says of a damaged file
 
 
 class Embedded(NamedTuple):
@@ -45,7 +46,7 @@ def animation(gif: bytes) -> Embedded:
             frames = [
                 (frame.convert("RGB"), frame.info.get("duration", 100)) for frame in ImageSequence.Iterator(image)
             ]
-    except (OSError, SyntaxError, ValueError):  # browsers are more patient
+    except UNREADABLE:  # browsers are more patient
         return Embedded(plain, size)
     pictures, lasting = zip(*frames, strict=True)
     small = _address(_webp(list(pictures), list(lasting)), "image/webp")

@@ -14,11 +14,13 @@ from reports.data.escaping import stem
 from reports.data.frame import FINAL, Results
 from reports.data.paper import Curves, Paper
 from reports.pages.embed import Embedded
-from reports.render import diagrams, figures, panels, scenes
+from reports.render import charts, diagrams, figures, panels, scenes
 from reports.render.canvas import Drawing
+from reports.render.charts import Chart
 from reports.render.tables import describe_task, joined, number, steps
 
 PAPERS = "fig_"
+ARMS = "_arms"  # ends the name of the figure that has each arm of another one in a frame of its own
 OWN = ("RHMC", "full")  # the paper's method
 HOW = "A band is how far seeds spread; names stand in the order of the final return."
 EACH = 48  # arms that have a frame each
@@ -37,6 +39,7 @@ class Picture(NamedTuple):
     behind: str = ""  # the command that made its numbers, where it is not the study's own
     fault: str = ""  # why it could not be drawn
     shown: Embedded | None = None  # as the page has it, once it is drawn
+    chart: Chart | None = None  # as the page has it instead, with a script
 
     @property
     def heading(self) -> str:
@@ -51,16 +54,22 @@ def reason(error: Exception) -> str:
 
 
 def picture(
-    name: str, title: str, make: Callable[[], Made | None], study: str = "", behind: str = ""
+    name: str,
+    title: str,
+    make: Callable[[], Made | None],
+    study: str = "",
+    behind: str = "",
+    chart: Callable[[], Chart | None] = lambda: None,
 ) -> Iterator[Picture]:
-    """The figure that `make` draws, none if that has no data for it, or its place if it fails."""
+    """The figure that `make` draws, none if that has no data for it, or its place if it or its chart fails."""
     try:
         made = make()
+        live = chart() if made else None
     except Exception as error:
         yield Picture(name, title, "", "", None, study, behind, reason(error))
     else:
         if made:
-            yield Picture(name, title, *made, study, behind)
+            yield Picture(name, title, *made, study, behind, chart=live)
 
 
 def gallery(results: Results, paper: Paper) -> list[Picture]:
@@ -283,8 +292,8 @@ def _curves(results: Results, spec: Curves, name: str) -> Iterator[Picture]:
         caption += "where a curve bends down again."
         return (caption, f"Small line charts. {_finals(results, spec.study)}", drawing) if drawing else None
 
-    yield from picture(name, spec.title, whole, spec.study)
-    yield from picture(f"{name}_arms", f"{spec.title}, arm by arm", each, spec.study)
+    yield from picture(name, spec.title, whole, spec.study, chart=lambda: charts.chart(results, spec, name))
+    yield from picture(f"{name}{ARMS}", f"{spec.title}, arm by arm", each, spec.study)
 
 
 def _finals(results: Results, study: str) -> str:

@@ -1,5 +1,7 @@
 """The report as one page of HTML that needs nothing else: figures inside, no network, the same bytes every time."""
 
+import io
+import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -8,18 +10,21 @@ from urllib.parse import quote
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
+from PIL import Image
 
 from reports.claims.verdicts import VERDICTS, Claim, described
 from reports.data.escaping import stem
 from reports.data.frame import TOLD, Results, adopted
 from reports.pages import embed
-from reports.pages.gallery import Picture
+from reports.pages.gallery import ARMS, Picture
+from reports.render.charts import Chart
 from reports.render.tables import NONE, Table
 
 TEMPLATE = "page.html.j2"
 NUMBER = re.compile(r"^[+<\s]*(-?\d[\d,]*(?:\.\d+)?)\s*([kM]?)\b")
 SHOWN = 2 / 3  # of a figure's pixels: all words on the page are then of one size
-LEGIBLE = 0.43  # of a figure's pixels: letters of 9.5 points at 160 dots an inch are then 9 pixels high
+LEGIBLE = 0.63  # of a figure's pixels: letters of 6.5 points at 160 dots an inch are then 9 pixels high
+FRAMED = 0.75  # the same of an animation's pixels, whose letters are 12 high
 FILES: Mapping[str, str] = {"PDF": "pdf", "numbers": "csv"}
 LONG = 66  # rows of a table that are shown at once: the pairs of twelve arms
 FILTERED = 8  # rows of a table above which it has a field for words; a script makes it
@@ -47,6 +52,16 @@ class Cell(NamedTuple):
 
     text: Markup
     key: str
+
+
+class Links(NamedTuple):
+    """The places of the page that show an arm, by study and arm, or the policy of a run, by study, arm and run."""
+
+    curves: Mapping[tuple[str, str], str]
+    episodes: Mapping[tuple[str, str, str], str]
+
+
+NOWHERE = Links({}, {})
 
 
 class Grid(NamedTuple):
@@ -80,6 +95,7 @@ class Plate(NamedTuple):
     behind: str
     files: list[tuple[str, str]]
     fault: str = ""  # why there is nothing to see
+    chart: Chart | None = None  # instead of the picture
 
 
 class Section(NamedTuple):
@@ -115,28 +131,58 @@ def render(content: Mapping[str, Any]) -> str:
     return env.get_template(TEMPLATE).render(content)
 
 
-def plate(picture: Picture, behind: str) -> Plate:
-    """A figure as it was drawn, or its place. behind: the command that made its numbers."""
-    kinds = ("PDF", "numbers") if picture.shown else ("numbers",) if picture.drawing else ()
+def plate(picture: Picture, behind: str, *, arms: bool = False) -> Plate:
+    """A figure as it was drawn, its chart, or its place.
+
+    Args:
+        picture: the figure.
+        behind: the command that made its numbers.
+        arms: whether the same arm by arm is a file beside the page.
+    """
+    there = bool(picture.shown or picture.chart)
+    kinds = ("PDF", "numbers") if there else ("numbers",) if picture.drawing else ()
     files = [(word, f"figures/{picture.name}.{FILES[word]}") for word in kinds]
+    files += [("arm by arm", f"figures/{picture.name}{ARMS}.pdf")] if arms else []
     about = (picture.name, picture.heading, picture.caption, picture.alt)
     if picture.shown is None:
-        return Plate(*about, "", 0, 0, 0, 0, behind, files, picture.fault)
+        return Plate(*about, "", 0, 0, 0, 0, behind, files, picture.fault, picture.chart)
     width, height = picture.shown.size
     return Plate(
         *about, picture.shown.address, width, height, round(width * SHOWN), round(width * LEGIBLE), behind, files
     )
 
 
-def episode(task: str, gif: bytes, folder: str) -> Plate:
-    """An animation from what `rhmc render` wrote, or its place. folder: of the GIF, which is linked; "" if far away."""
+def episode(task: str, gif: bytes, folder: str, whose: str = "") -> Plate:
+    """An animation from what `rhmc render` wrote, or its place.
+
+    Args:
+        task: that it shows.
+        gif: the file.
+        folder: of the GIF, which is linked; "" if far away.
+        whose: the trained policy, in words; "" if it is not known.
+    """
     words = f"{EPISODE_WORDS.get(task, 'A trained policy, and others in the same episode.')} {EPISODE_NAMES}"
-    about = (f"episode_{stem(task)}", f"An episode of {task}", words, words)
+    words += f" The trained policy: {whose}." if whose else ""
+    about = (anchor(task), f"An episode of {task}", words, words)
     if fault := animation_fault(gif):
         return Plate(*about, "", 0, 0, 0, 0, "rhmc render", [], fault)
     address, (width, height) = embed.animation(gif)
     files = [("GIF", f"{folder}/{quote(f'episode_{task}.gif')}")] if folder else []
-    return Plate(*about, address, width, height, width, round(width * SHOWN), "rhmc render", files)
+    return Plate(*about, address, width, height, width, round(width * FRAMED), "rhmc render", files)
+
+
+def anchor(task: str) -> str:
+    """The anchor of a task's animation."""
+    return f"episode_{stem(task)}"
+
+
+def shown_in(gif: bytes) -> str:
+    """The run whose policy an animation shows, as `rhmc render` notes it in the file; nothing if it does not."""
+    try:
+        with Image.open(io.BytesIO(gif)) as image:
+            return str(json.loads(image.info.get("comment", b"{}"))["run"])
+    except (*embed.UNREADABLE, TypeError, KeyError):  # of another program, or no picture at all
+        return ""
 
 
 def animation_fault(gif: bytes) -> str:
@@ -145,11 +191,30 @@ def animation_fault(gif: bytes) -> str:
     return "" if whole else f"the file is not a whole GIF ({len(gif)} bytes)"
 
 
-def grid(name: str, table: Table, *, files: bool = True) -> Grid:
-    """A table, every cell with what it is sorted by."""
+def grid(name: str, table: Table, links: Links = NOWHERE, *, files: bool = True) -> Grid:
+    """A table, every cell with what it is sorted by, and its arms with links to their curves and animations."""
     columns = [str(column) for column in table.shown.columns]
     rows = [[cell(str(text)) for text in row] for row in table.shown.to_numpy(str)]
+    numbers = table.numbers
+    if {"study", "arm"} <= set(numbers) and len(numbers) == len(rows) and "arm" in (at := [c.lower() for c in columns]):
+        place = at.index("arm")
+        for row, found in zip(rows, numbers.to_dict("records"), strict=True):
+            row[place] = linked(row[place], links, str(found["study"]), str(found["arm"]), found.get("run"))
     return Grid(f"table-{name}", table.title, table.note, columns, rows, f"{table.folder}/{name}" if files else "")
+
+
+def linked(found: Cell, links: Links, study: str, arm: str, run: Any = None) -> Cell:
+    """The name of an arm with links to its curve and to its animation where they exist.
+
+    run: whose row it is, with the animation of this run alone; None for the arm, with that of any of its runs.
+    """
+    text, curve = found.text, links.curves.get((study, arm))
+    if curve:
+        text = Markup('<a href="#{}">{}</a>').format(curve, text)
+    for (in_study, of_arm, shown), place in links.episodes.items():
+        if (in_study, of_arm) == (study, arm) and run in (None, shown):
+            text += Markup(' <a href="#{}">animation</a>').format(place)
+    return Cell(text, found.key)
 
 
 def cell(text: str) -> Cell:

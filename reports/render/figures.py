@@ -67,7 +67,10 @@ def learning_curves(results: Results, spec: Curves) -> Drawing | None:
     yardsticks = yardsticks_in(results, spec)
     levels = {arm: spec.levels[arm] for arm in arms if arm in spec.levels}
     lines = _yardstick_labels(yardsticks) + _level_labels(levels)
-    names, late = _curve_labels(curves, results, spec.study), _late(curves, [*yardsticks.values(), *levels.values()])
+    names, late = (
+        _curve_labels(curves, results, spec.study),
+        late_part(curves, [*yardsticks.values(), *levels.values()]),
+    )
     entries = {arm: "\n".join(wrap(f"{arm} ({_seed_words(results, spec, arm)})", LEGEND)) for arm in curves}
     columns, rows = legend_size(entries.values())
     unit = per(results, results.env(spec.study).get("kind", ""))
@@ -93,7 +96,7 @@ def learning_curves(results: Results, spec: Curves) -> Drawing | None:
                 axes.set_xlabel("")
                 _draw_box(axes, late)
             write_labels(axes, labels, LINE / tall)
-        head(figure, spec.title, _task(results, spec.study))
+        head(figure, spec.title, task_words(results, spec.study))
         write_legend(figure, entries, arms, columns, (height - HEAD) / height)
         foot(figure, footer(results, spec))
     return Drawing(figure, plotted(curves, yardsticks, levels))
@@ -107,7 +110,7 @@ class Late(NamedTuple):
     high: float
 
 
-def _late(curves: Mapping[str, pd.DataFrame], lines: Sequence[float]) -> Late | None:
+def late_part(curves: Mapping[str, pd.DataFrame], lines: Sequence[float]) -> Late | None:
     """The part to enlarge; None where the curves end far enough from each other. lines: other heights of the axes."""
     last = max(float(rows["step"].max()) for rows in curves.values())
     late = [rows[rows["step"] >= LATE * last] for rows in curves.values()]
@@ -133,7 +136,7 @@ def _draw_box(axes: Axes, late: Late) -> None:
     )
 
 
-def _task(results: Results, study: str) -> str:
+def task_words(results: Results, study: str) -> str:
     """The task of all arms, or how many they have."""
     found = results.by_task(study)
     return describe_task(found[0][0]) if len(found) == 1 else f"{len(found)} tasks, so no yardstick is common to all"
@@ -250,9 +253,9 @@ def _yardstick_labels(yardsticks: Mapping[str, float]) -> list[Label]:
 def _level_labels(levels: Mapping[str, float]) -> list[Label]:
     """The paper's final values; arms with the same value share a line."""
     found = []
-    for y, arms in _by_level(levels).items():
+    for y, arms in by_level(levels).items():
         text = "\n".join(wrap(f"paper, {joined(arms)}: {y:g}", LETTERS + 4))
-        found.append(Label(y, text, _level_colour(arms), False))
+        found.append(Label(y, text, level_colour(arms), False))
     return found
 
 
@@ -268,11 +271,11 @@ def _curve_labels(curves: Mapping[str, pd.DataFrame], results: Results, study: s
     return labels
 
 
-def _by_level(levels: Mapping[str, float]) -> dict[float, list[str]]:
+def by_level(levels: Mapping[str, float]) -> dict[float, list[str]]:
     return {y: [arm for arm in levels if levels[arm] == y] for y in sorted(set(levels.values()))}
 
 
-def _level_colour(arms: Sequence[str]) -> str:
+def level_colour(arms: Sequence[str]) -> str:
     return look(arms[0], arms).colour if len(arms) == 1 else QUIET
 
 
@@ -282,8 +285,8 @@ def _draw_yardsticks(axes: Axes, yardsticks: Mapping[str, float]) -> None:
 
 
 def _draw_levels(axes: Axes, levels: Mapping[str, float]) -> None:
-    for y, arms in _by_level(levels).items():
-        axes.axhline(y, color=_level_colour(arms), linewidth=1.4, linestyle=":", zorder=2)
+    for y, arms in by_level(levels).items():
+        axes.axhline(y, color=level_colour(arms), linewidth=1.4, linestyle=":", zorder=2)
 
 
 def draw_curve(axes: Axes, rows: pd.DataFrame, own: Look, place: int | None = None) -> None:

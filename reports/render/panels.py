@@ -66,19 +66,19 @@ def panels(results: Results, spec: Curves) -> Drawing | None:
         height = HEAD + ROW * rows + lines * (top + TALL + BELOW) + END
         figure = blank(WIDTH, height)
         one = len(results.by_task(spec.study)) == 1
-        range_ = _range(curves, found) if one else None
+        range_ = heights(curves, found) if one else None
         for n, (group, title) in enumerate(zip(found, titles, strict=True)):
             row, column = divmod(n, COLUMNS)
             bottom = height - HEAD - ROW * rows - (row + 1) * (top + TALL) - row * BELOW
             axes = figure.add_axes((0.06 + 0.316 * column, bottom / height, 0.27, TALL / height))
             _draw(axes, results, spec.study, group, curves, shared)
-            axes.set_ylim(*(range_ or _range(curves, [group])))
+            axes.set_ylim(*(range_ or heights(curves, [group])))
             axes.set_title("\n".join(title), fontsize=7.5, loc="left", linespacing=1.25, pad=3)
             _finish(axes)
         task = describe_task(results.env(spec.study)) if one else f"a frame for each of {len(found)} tasks"
         head(figure, spec.title, f"{task}; return ({per(results, results.task(spec.study))}) against environment steps")
         write_legend(figure, entries, names, columns, (height - HEAD) / height)
-        foot(figure, _footer(results, spec.study, curves, bool(shared)))
+        foot(figure, frames_footer(results, spec.study, curves, bool(shared)))
     parts = [
         plotted({arm: curves[arm] for arm in group.arms.values()}, group.yardsticks, {}).assign(frame=group.title)
         for group in found
@@ -150,7 +150,7 @@ def _two(results: Results, env: Mapping[str, Any], spec: Curves) -> dict[str, fl
     return {name: known[name] for name in kept}
 
 
-def _extremes(results: Results, study: str, group: Group) -> tuple[str, str] | None:
+def extremes(results: Results, study: str, group: Group) -> tuple[str, str] | None:
     """The names of the best and of the worst arm by the mean final return; None with fewer than two finished."""
     values = {name: x for name, arm in group.arms.items() if len(x := results.finals(study, arm))}
     order = sorted(values, key=lambda name: -float(values[name].mean()))
@@ -160,7 +160,7 @@ def _extremes(results: Results, study: str, group: Group) -> tuple[str, str] | N
 def _title(results: Results, study: str, group: Group) -> list[str]:
     """Lines above a frame: its name, its best and its worst arm."""
     title = wrap(group.title or f"all {len(group.arms)} arms", LETTERS)
-    ends = _extremes(results, study, group)
+    ends = extremes(results, study, group)
     if ends is None:
         return title
     said = [
@@ -185,7 +185,7 @@ def _draw(
         axes.axhline(y, color=FAINT, linewidth=1, linestyle=(0, (6, 2)) if name.endswith("_bound") else "-", zorder=1)
         at: dict[str, Any] = {"transform": axes.get_yaxis_transform(), "va": "bottom", "ha": "right", "fontsize": 6.5}
         axes.text(0.99, y, f"{readable(name)} {number(y)}", color=QUIET, **at)
-    ends = dict(zip(_extremes(results, study, group) or (), (BEST, WORST), strict=False))
+    ends = dict(zip(extremes(results, study, group) or (), (BEST, WORST), strict=False))
     for place, (name, arm) in enumerate(group.arms.items()):
         if shared:
             draw_curve(axes, curves[arm], look(name, shared), place)
@@ -195,7 +195,7 @@ def _draw(
             axes.plot(curves[arm]["step"], curves[arm]["mean"], color="#CFCFCF", linewidth=0.8, zorder=2)
 
 
-def _range(curves: Mapping[str, pd.DataFrame], found: Sequence[Group]) -> tuple[float, float]:
+def heights(curves: Mapping[str, pd.DataFrame], found: Sequence[Group]) -> tuple[float, float]:
     """Heights of frames: what their arms hold after the first rise, and their yardsticks."""
     low, high = held({arm: curves[arm] for group in found for arm in group.arms.values()})
     lines = [y for group in found for y in group.yardsticks.values()]
@@ -211,7 +211,7 @@ def _finish(axes: Axes) -> None:
     axes.tick_params(labelsize=7)
 
 
-def _footer(results: Results, study: str, curves: Mapping[str, pd.DataFrame], shared: bool) -> str:
+def frames_footer(results: Results, study: str, curves: Mapping[str, pd.DataFrame], shared: bool) -> str:
     budget = results.budget(study)
     first = (
         f"profile: {results.profile}, {steps(budget) if budget else 'unknown'} steps; the axis is cut below what arms "

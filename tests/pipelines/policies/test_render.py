@@ -16,6 +16,7 @@ from pipelines.tracking import policy
 from pipelines.tracking.policy import Actor, Saved
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.work_folder import Home
+from reports.pages.page import shown_in
 from rhmc.envs import coverage, navigation
 from rhmc.training.evaluation import evaluate
 from rhmc.training.trainer import Trainer
@@ -219,9 +220,11 @@ def test_a_run_of_the_log_is_drawn_and_an_unfinished_one_is_not(home: Path, tmp_
     log = tracker.start(CARD)
     with pytest.raises(InputError, match=rf"run {log.ref} keeps no policy\.pt: it is not finished"):
         render.render(log.ref, tmp_path / "a.gif", Home(home))
-    policy.save(tmp_path / "policy.pt", saved(run("iql")))
+    spec = run("iql")
+    policy.save(tmp_path / "policy.pt", saved(spec))
     log.artifact(tmp_path / "policy.pt")
-    assert render.render(log.ref, tmp_path / "a.gif", Home(home), frames=2).exists()
+    drawn = render.render(log.ref, tmp_path / "a.gif", Home(home), episode=3, frames=2).read_bytes()
+    assert shown_in(drawn) == spec.id  # the report's page leads from the run's row to it
     with pytest.raises(InputError, match="0" * 32):
         render.render("0" * 32, tmp_path / "b.gif", Home(home))
     assert not (tmp_path / "b.gif").exists()

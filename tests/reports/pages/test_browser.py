@@ -10,6 +10,7 @@ import subprocess
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import pandas as pd
 import pytest
 
 from reports.data.paper import read
@@ -43,7 +44,41 @@ found.rows_of.right = seen().every((row) => row.textContent.includes("no regulat
 found.rows_of.said = document.getElementById("said").textContent;
 type("");
 found.rows_of.again = seen().length;
-found.fields = document.querySelectorAll("input").length;
+found.fields = document.querySelectorAll("input[type=search]").length;
+const chart = document.querySelector("#fig_10 .chart"), value = (key) => button(key).querySelector("b").textContent;
+const button = (key) => [...chart.querySelectorAll(".names button")].find((one) => one.dataset.key === key);
+const line = (key) => [...chart.querySelectorAll("g[data-key]")].find((one) => one.dataset.key === key);
+const drawn = (key) => line(key).getBoundingClientRect().width;
+const press = (words) => [...chart.querySelectorAll(".bar button")].find((one) => one.textContent === words).click();
+const read = (share) => {
+  const slide = chart.querySelector("input");
+  slide.value = share * slide.max;
+  slide.dispatchEvent(new Event("input"));
+  const said = slide.getAttribute("aria-valuetext");
+  return [chart.querySelector("output").textContent, value("full"), value("random"), said];
+};
+const pressed = (key) => button(key).getAttribute("aria-pressed");
+found.chart = {still: value("full"), whole: drawn("full"), half: read(0.5), end: read(1), first: read(0)};
+button("full").click();
+found.chart.off = [pressed("full"), drawn("full"), pressed("no filter")];
+press("Show all");
+found.chart.on = [pressed("full"), drawn("full")];
+const wide = (one) => one.getBoundingClientRect().width;
+const seeds = () => [...line("full").querySelectorAll(".seed")].filter(wide).length;
+found.chart.seeds = [seeds(), (press("Every seed"), seeds())];
+press("Processor time");
+const tick = getComputedStyle(chart.querySelector(".xs .step"));
+found.chart.timed = [drawn("full"), drawn("no filter"), read(0.5)[0], read(1)[1], tick.display];
+press("Steps");
+found.chart.again = [drawn("full"), value("full")];
+chart.querySelector(".area").dispatchEvent(new PointerEvent("pointermove", {clientX: 0}));
+found.chart.hover = value("full");
+chart.querySelector(".area").dispatchEvent(new PointerEvent("pointerleave"));
+found.chart.left = value("full");
+const named = [...document.querySelectorAll("svg[role=img]")].map((one) => one.getAttribute("aria-label").length);
+found.named = named.filter((letters) => letters < 20).length;
+const link = document.querySelector("#table-final_ablation tbody a").getAttribute("href");
+found.link = [document.getElementById(link.slice(1)).textContent.trim()];
 const links = [...document.querySelectorAll("a[href]")].map((link) => link.getAttribute("href"));
 found.lost = links.filter((href) => href.startsWith("#") && !document.getElementById(href.slice(1)));
 found.files = links.filter((href) => !href.startsWith("#"));
@@ -53,7 +88,7 @@ found.images = document.images.length;
 const rows = [...document.querySelectorAll(".forest li a")].map((row) => row.getBoundingClientRect());
 found.rows = {count: rows.length, end: rows.at(-1).bottom, least: Math.min(...rows.map((row) => row.height))};
 found.spoken = [...document.querySelectorAll(".forest li a .sr")].filter((one) => one.textContent.length < 30).length;
-const letters = (image) => 9.5 / 72 * 160 * image.getBoundingClientRect().width / image.getAttribute("width");
+const letters = (image) => 6.5 / 72 * 160 * image.getBoundingClientRect().width / image.getAttribute("width");
 const plates = [...document.images].filter((image) => image.getBoundingClientRect().width && image.src.includes("svg"));
 found.letters = Math.min(...plates.map(letters));
 document.querySelector(".forest li a").focus({focusVisible: true});
@@ -64,8 +99,12 @@ found.folded = !document.querySelector(run).closest("details").open;
 location.hash = run;
 setTimeout(() => {
   found.unfolded = document.querySelector(run).closest("details").open;
-  document.title = "FOUND" + JSON.stringify(found) + "END";
+  location.hash = link;
 }, 200);
+setTimeout(() => {
+  found.link.push(line("full").classList.contains("on"));
+  document.title = "FOUND" + JSON.stringify(found) + "END";
+}, 400);
 </script>
 """
 
@@ -114,9 +153,30 @@ def test_it_opens_sorts_and_leads_on(made: Path, tmp_path: Path) -> None:
     assert [name for name in found["files"] if not (made / name).exists()] == [paper]
     assert (found["blank"], found["unnamed"]) == (0, 0)
     assert found["images"] > 8
+    assert found["named"] == 0
+    assert found["link"] == ["full 70.0", True]  # a row leads to its curve, which then stands out
     assert (found["rows"]["count"], found["spoken"], found["ring"]) == (23, 0, "solid")
     assert found["folded"]
     assert found["unfolded"]
+
+
+def test_a_chart_is_chosen_from_read_and_stretched(made: Path, tmp_path: Path) -> None:
+    chart = visit(copy(made, tmp_path)).found["chart"]
+    rows = pd.read_csv(made / "figures" / "fig_10.csv").set_index(["name", "step"])
+    values = [f"{rows[column]['full', 0]:.2f}" for column in ("value", "low", "high")]
+    first = "{} ({} to {})".format(*values)
+    assert chart["still"] == chart["left"] == "70.0"  # the final return
+    assert chart["half"] == ["at 75 k steps: mean (interval)", "70.00 (69.00 to 71.00)", "30.4", "at 75 k steps"]
+    assert chart["first"][:2] == ["at 0 steps: mean (interval)", first]
+    assert (chart["end"][0], chart["hover"]) == ("at 150 k steps: mean (interval)", first)
+    whole = chart["whole"]
+    assert whole > 300
+    assert (chart["off"], chart["on"]) == (["false", 0, "true"], ["true", whole])
+    assert chart["seeds"] == [0, 3]
+    assert chart["timed"] == [  # the other arm takes twice as long
+        *(pytest.approx(whole / 2), whole, "after 1.5 s: mean (interval)", "–", "none")
+    ]
+    assert chart["again"] == [whole, "70.0"]
 
 
 @pytest.mark.parametrize(("size", "scheme"), [("500,900", "light"), ("1280,900", "dark")])

@@ -71,6 +71,12 @@ def test_an_animation_is_the_same_frame_by_frame() -> None:
     assert after[1].info["duration"] == 110
 
 
+def test_a_gif_that_claims_to_be_huge_is_left_as_it_is() -> None:
+    data = gif(3)
+    data = data[:6] + b"\xff\xff\xff\xff" + data[10:]
+    assert embed.animation(data).address == f"data:image/gif;base64,{base64.b64encode(data).decode()}"
+
+
 @pytest.mark.parametrize("cut", [30, 60])
 def test_a_gif_that_cannot_be_read_is_left_as_it_is(cut: int) -> None:
     data = gif(3)[:cut] + b";"

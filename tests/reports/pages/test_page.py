@@ -85,7 +85,13 @@ def test_every_link_leads_somewhere(made: Path, read: Reader) -> None:
 
 def test_every_figure_has_words_for_those_who_do_not_see_it(made: Path, read: Reader) -> None:
     images = list(read.of("img"))
-    assert len(images) == len(list((made / "figures").glob("*.png"))) + 1  # and an animation
+    charts = [box for box in read.of("div") if box.get("class", "").startswith("chart")]
+    assert len(charts) == 2
+    assert len(images) + len(charts) == len(list((made / "figures").glob("*.png"))) + 1  # and an animation
+    drawn = [found["aria-label"] for found in read.of("svg") if found.get("role") == "img"]
+    assert sum(label.startswith("Line chart of return") for label in drawn) == 2
+    assert all(len(label) > 30 for label in drawn)
+    assert all(figure.get("aria-label") for figure in read.of("figure"))
     for image in images:
         assert len(image["alt"]) > 30
         assert int(image["width"]) > int(image["height"]) / 3 > 0
@@ -123,6 +129,7 @@ def test_claims_have_all_that_belongs_to_them(read: Reader) -> None:
 
 def test_tables_sort_by_keyboard(made: Path, read: Reader) -> None:
     heads = list(read.of("th"))
+    assert [box for box in read.of("div") if box.get("class") == "bar" and "hidden" not in box] == []
     assert heads
     assert all(head == {"scope": "col"} for head in heads)
     buttons = [attributes for attributes in read.of("button") if attributes == {"type": "button"}]
@@ -153,8 +160,29 @@ def test_an_animation_leads_to_its_gif_where_that_is_beside_the_page(tmp_path: P
         build(runs, out, "quick")
         links = {link["href"] for link in Reader((out / "index.html").read_text()).of("a")}
         assert ("runs/episode_coverage.gif" in links) is linked
+        assert "#episode_coverage" not in links  # the file does not say whose episode it is
         words = Reader((out / "index.html").read_text()).text
         assert "the seed that this was trained with, and the number of the episode" in words
+
+
+@pytest.mark.usefixtures("unpainted")
+def test_rows_lead_to_the_curve_of_their_arm_and_to_the_animation_of_their_run(tmp_path: Path) -> None:
+    points, plan = study("coverage", {"RHMC": noisy(67), "IQL": noisy(63)}, points=3)
+    runs = write(tmp_path / "runs", (points, plan))
+    note = b'{"run": "%s", "episode": 1}' % plan["run"][1].encode()
+    (runs / "episode_coverage.gif").write_bytes(GIF[:19] + b"\x21\xfe" + bytes([len(note)]) + note + b"\0" + GIF[19:])
+    build(runs, tmp_path, "quick")
+    text = (tmp_path / "index.html").read_text()
+    assert "The trained policy: study coverage, arm RHMC, seed 1." in Reader(text).text
+    table = text[text.index('id="table-runs"') :]
+    cells = re.findall(r"<tr id.*?</tr>", table)
+    assert ["#episode_coverage" in row for row in cells] == [plan["run"][1] in row for row in cells]
+    finals = re.findall(r"<tr>.*?</tr>", text[text.index('id="table-final_coverage"') :])[1:3]
+    assert ["animation" in row for row in finals] == [True, False]
+    assert [re.findall(r'href="#(fig_7\.\d)">(\w+)', row) for row in finals] == [
+        [("fig_7.1", "RHMC")],
+        [("fig_7.2", "IQL")],
+    ]
 
 
 @pytest.mark.usefixtures("unpainted", "quick_resampling")
