@@ -11,7 +11,7 @@ from typing import Literal
 
 from torch import Generator
 
-from rhmc.algorithms import ppo
+from rhmc.algorithms import ppo, recurrent_ppo
 from rhmc.algorithms.base import About, Method, register_method
 from rhmc.types import Spec
 
@@ -34,7 +34,7 @@ class Config(ppo.Config):
 
 def build(cfg: Config, spec: Spec, num_envs: int, rng: Generator) -> ppo.PPO:
     """The learner."""
-    return ppo.PPO(cfg, spec, rng, "central")
+    return recurrent_ppo.learner(cfg, spec, rng, "central")
 
 
 register_method("mappo", Method(Config, build, ABOUT))
