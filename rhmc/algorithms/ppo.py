@@ -18,9 +18,10 @@ from torch.nn.functional import huber_loss
 from rhmc.learning import checkpoint
 from rhmc.learning.experience import Rollout, flat, minibatches, values
 from rhmc.learning.learner import Learner, Learners, taken, unpack
+from rhmc.learning.memory import Recurrent
 from rhmc.learning.normalisation import Standardiser
 from rhmc.learning.returns import gae, normalised
-from rhmc.learning.settings import OnPolicy, Recurrent, Standardised
+from rhmc.learning.settings import OnPolicy, Standardised
 from rhmc.networks.nets import Sizes, team
 from rhmc.networks.recurrent import encoder
 from rhmc.networks.sampling import gumbel

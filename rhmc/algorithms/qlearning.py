@@ -15,9 +15,10 @@ from torch.nn.functional import mse_loss
 from rhmc.learning import checkpoint
 from rhmc.learning.experience import Experience
 from rhmc.learning.learner import Learner, Learners, pack_step, taken, unpack
+from rhmc.learning.memory import Recurrent
 from rhmc.learning.normalisation import Standardiser
 from rhmc.learning.schedules import linear
-from rhmc.learning.settings import OffPolicy, Recurrent, Standardised, TargetNetworks
+from rhmc.learning.settings import OffPolicy, Standardised, TargetNetworks
 from rhmc.networks.nets import Sizes, team
 from rhmc.networks.recurrent import encoder
 from rhmc.types import Batch, Carry, Obs, Spec, State, Transition

@@ -4,7 +4,6 @@ from pydantic import Field
 
 from rhmc.learning.normalisation import Scale
 from rhmc.networks.nets import EncoderName
-from rhmc.networks.recurrent import AnyEncoderName, remembers
 from rhmc.types import Frozen
 
 
@@ -53,32 +52,3 @@ class OnPolicy(Frozen):
 
     n_steps: int = Field(25, ge=1, description="steps of each environment between updates")
     ent_coef: float = Field(0.01, ge=0, description="weight of the policy's entropy")
-
-
-class Recurrent(Networks):
-    """Settings of methods whose networks may have memory."""
-
-    encoder: AnyEncoderName = Field(  # type: ignore[assignment]  # more than those of a method without memory
-        "mlp",
-        description="`mlp`: all features in a row; `pairwise`: one network for all (agent, target) pairs, pooled; "
-        "`mlp_gru`, `pairwise_gru`: the same with a GRU behind, which remembers within an episode",
-    )
-    segment_length: int = Field(
-        16, ge=1, description="with a GRU: steps in a row that are learned from at once, through which gradients flow"
-    )
-
-    @property
-    def remembers(self) -> bool:
-        """True if the encoder has memory."""
-        return remembers(self.encoder)
-
-    def need_segments(self, name: str) -> None:
-        """See that a number of steps is one of whole segments.
-
-        Raises:
-            ValueError: it is not, and there is a GRU.
-        """
-        steps = getattr(self, name)
-        if self.remembers and steps % self.segment_length:
-            allowed = f"multiples of segment_length, {self.segment_length}"
-            raise ValueError(f"{name}: {steps} is not allowed with encoder '{self.encoder}'; allowed: {allowed}")

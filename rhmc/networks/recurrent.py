@@ -31,7 +31,8 @@ class Cell(nn.Module):
         gates, new = inputs.split((2 * size, size), -1)
         by_state, by_new = self.hidden(state).split((2 * size, size), -1)
         reset, keep = (gates + by_state).sigmoid().chunk(2, -1)
-        return torch.lerp((new + reset * by_new).tanh(), state, keep)
+        candidate = (new + reset * by_new).tanh()
+        return candidate + keep * (state - candidate)
 
 
 class Recurrent(nn.Module):
