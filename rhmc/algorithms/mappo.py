@@ -2,9 +2,9 @@
 
 Source: Yu et al. 2022 (objective, value normalisation, Huber loss, orthogonal weights, wide rollouts) after Schulman et
 al. 2017; the RHMC text, section 5.1, has its adaptive KL penalty in place of the clip: `objective: kl_adaptive`.
-Departures: ReLU, without layer normalisation; feed-forward networks unless `encoder` has a GRU; no clipped value loss; 4 minibatches and lr
-2e-3 instead of 1 and 7e-4; the statistics of returns count each rollout once; the critic sees what all agents observe
-and, with `mlp`, the agent's id; truncation bootstraps (`trainer.bootstrap_on_truncation`).
+Departures: ReLU, without layer normalisation; feed-forward networks unless `encoder` has a GRU; no clipped value loss;
+4 minibatches and lr 2e-3 instead of 1 and 7e-4; the statistics of returns count each rollout once; the critic sees what
+all agents observe and, with `mlp`, the agent's id; truncation bootstraps (`trainer.bootstrap_on_truncation`).
 """
 
 from typing import Literal

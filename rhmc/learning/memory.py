@@ -15,7 +15,7 @@ class Recurrent(Networks):
         "`mlp_gru`, `pairwise_gru`: the same with a GRU behind, which remembers within an episode",
     )
     segment_length: int = Field(
-        16, ge=1, description="with a GRU: steps in a row that are learned from at once, through which gradients flow"
+        8, ge=1, description="with a GRU: steps in a row that are learned from at once, through which gradients flow"
     )
 
     @property
