@@ -479,7 +479,7 @@ def test_a_heavy_import_is_found_at_any_depth() -> None:
 # Tables
 
 
-FAMILIES = {"ppo", "qlearning"}  # what the pages of a family share: no methods
+FAMILIES = {"ppo", "qlearning", "recurrent_ppo", "recurrent_qlearning"}  # what the pages of a family share: no methods
 PAGES = sorted(p for p in (ROOT / "rhmc/algorithms").glob("*.py") if p.stem not in {"__init__", "base", *FAMILIES})
 
 

@@ -1,13 +1,14 @@
 """From which step on a run learns: a budget that ends before leaves the networks as they were drawn.
 
-Off-policy methods wait for `learning_starts`, on-policy ones for a rollout, HiT-MAC's coordinator for the end of the
-executors' practice. Steps are environment steps, summed over the parallel copies as everywhere.
+Off-policy methods wait for `learning_starts`, with memory for a whole segment too, on-policy ones for a rollout,
+HiT-MAC's coordinator for the end of the executors' practice. Steps are environment steps, summed over the parallel
+copies as everywhere.
 """
 
 from typing import Any, NamedTuple
 
 from pipelines.specs.study import Setting
-from rhmc.algorithms import hitmac, rhmc
+from rhmc.algorithms import hitmac, qlearning, rhmc
 from rhmc.envs import ENVS
 from rhmc.learning.settings import OffPolicy, OnPolicy
 
@@ -26,6 +27,8 @@ def starts(setting: Setting) -> list[Start]:
         return _hitmac(algo, copies, _episode(setting))
     if isinstance(algo, rhmc.Config):
         return _rhmc(algo, copies, _episode(setting))
+    if isinstance(algo, qlearning.Config) and algo.remembers:
+        return [_segments(algo, copies)]
     if isinstance(algo, OffPolicy):
         return [_warm(algo, copies)]
     if not isinstance(algo, OnPolicy):
@@ -58,6 +61,14 @@ def _warm(algo: Any, copies: int, updates: int = 1) -> Start:
     step = _up(algo.learning_starts + updates * algo.train_freq, copies)
     each = f"train_freq {algo.train_freq:,}" + (f" x {updates:,}" if updates > 1 else "")
     return Start(step, f"learning_starts {algo.learning_starts:,} + {each}")
+
+
+def _segments(algo: qlearning.Config, copies: int) -> Start:
+    """A segment has to be whole."""
+    start, whole = _warm(algo, copies), copies * algo.segment_length
+    if whole <= (start.step or 0):
+        return start
+    return Start(whole, f"segment_length {algo.segment_length:,} x num_envs {copies:,}")
 
 
 def _rhmc(algo: rhmc.Config, copies: int, episode: int) -> list[Start]:

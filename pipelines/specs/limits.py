@@ -21,6 +21,7 @@ BOUNDS: dict[str, int] = {  # by name of a field or an option
     "buffer_size": 100_000_000,
     "batch_size": 1_000_000,
     "n_steps": 100_000,
+    "segment_length": 100_000,
     "epochs": 10_000,
     "minibatches": 10_000,
     "actor_minibatches": 10_000,

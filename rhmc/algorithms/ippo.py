@@ -8,7 +8,7 @@ from typing import Literal
 
 from torch import Generator
 
-from rhmc.algorithms import ppo
+from rhmc.algorithms import ppo, recurrent_ppo
 from rhmc.algorithms.base import About, Method, register_method
 from rhmc.types import Spec
 
@@ -31,7 +31,7 @@ class Config(ppo.Config):
 
 def build(cfg: Config, spec: Spec, num_envs: int, rng: Generator) -> ppo.PPO:
     """The learner."""
-    return ppo.PPO(cfg, spec, rng, "local")
+    return recurrent_ppo.learner(cfg, spec, rng, "local")
 
 
 register_method("ippo", Method(Config, build, ABOUT))

@@ -2,16 +2,16 @@
 
 Source: Yu et al. 2022 (objective, value normalisation, Huber loss, orthogonal weights, wide rollouts) after Schulman et
 al. 2017; the RHMC text, section 5.1, has its adaptive KL penalty in place of the clip: `objective: kl_adaptive`.
-Departures: feed-forward networks with ReLU, without layer normalisation; no clipped value loss; 4 minibatches and lr
-2e-3 instead of 1 and 7e-4; the statistics of returns count each rollout once; the critic sees what all agents observe
-and, with `mlp`, the agent's id; truncation bootstraps (`trainer.bootstrap_on_truncation`).
+Departures: ReLU, without layer normalisation; feed-forward networks unless `encoder` has a GRU; no clipped value loss;
+4 minibatches and lr 2e-3 instead of 1 and 7e-4; the statistics of returns count each rollout once; the critic sees what
+all agents observe and, with `mlp`, the agent's id; truncation bootstraps (`trainer.bootstrap_on_truncation`).
 """
 
 from typing import Literal
 
 from torch import Generator
 
-from rhmc.algorithms import ppo
+from rhmc.algorithms import ppo, recurrent_ppo
 from rhmc.algorithms.base import About, Method, register_method
 from rhmc.types import Spec
 
@@ -34,7 +34,7 @@ class Config(ppo.Config):
 
 def build(cfg: Config, spec: Spec, num_envs: int, rng: Generator) -> ppo.PPO:
     """The learner."""
-    return ppo.PPO(cfg, spec, rng, "central")
+    return recurrent_ppo.learner(cfg, spec, rng, "central")
 
 
 register_method("mappo", Method(Config, build, ABOUT))

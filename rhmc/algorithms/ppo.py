@@ -3,31 +3,34 @@
 A rollout of all environments gives generalised advantages, normalised over the batch, and lambda-returns as the
 critic's targets (Schulman et al. 2016 and 2017). `objective` says what keeps the new policy near the one that acted:
 `clip`, the ratio of their probabilities (2017, eq. 7); `kl_adaptive`, a penalty on the divergence between them whose
-weight doubles or halves when the divergence misses its target (2017, section 4).
+weight doubles or halves when the divergence misses its target (2017, section 4). With memory:
+`rhmc.algorithms.recurrent_ppo`.
 """
 
 from collections.abc import Callable, Iterable
-from typing import Literal, Protocol
+from typing import Literal, Protocol, Self
 
 import torch
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch import Generator, Tensor, nn
 from torch.nn.functional import huber_loss
 
 from rhmc.learning import checkpoint
 from rhmc.learning.experience import Rollout, flat, minibatches, values
 from rhmc.learning.learner import Learner, Learners, taken, unpack
+from rhmc.learning.memory import Recurrent
 from rhmc.learning.normalisation import Standardiser
 from rhmc.learning.returns import gae, normalised
-from rhmc.learning.settings import Networks, OnPolicy, Standardised
-from rhmc.networks.nets import ENCODERS, Sizes, team
+from rhmc.learning.settings import OnPolicy, Standardised
+from rhmc.networks.nets import Sizes, team
+from rhmc.networks.recurrent import encoder
 from rhmc.networks.sampling import gumbel
 from rhmc.types import Batch, Carry, Obs, Spec, State, Transition
 
 POLICY_GAIN = 0.01  # of the policy's last layer at the start: nearly uniform
 
 
-class Config(Networks, Standardised, OnPolicy):
+class Config(Recurrent, Standardised, OnPolicy):
     """Settings; gamma is the paper's, the rest the MAPPO authors' (Yu et al. 2022) but for more and larger steps.
 
     With 1 minibatch and their lr of 7e-4, navigation takes several times as many environment steps to learn.
@@ -47,6 +50,14 @@ class Config(Networks, Standardised, OnPolicy):
     )
     kl_target: float = Field(0.01, gt=0, description="kl_adaptive: divergence of a rollout's updates, in nats")
     huber: float = Field(10.0, gt=0, description="error of the value beyond which its loss is linear")
+    segment_length: int = Field(
+        25, ge=1, description="with a GRU: steps in a row that are learned from at once, through which gradients flow"
+    )
+
+    @model_validator(mode="after")
+    def _whole_segments(self) -> Self:
+        self.need_segments("n_steps")
+        return self
 
 
 class Objective(Protocol):
@@ -113,14 +124,14 @@ class PPO:
 
     def __init__(self, cfg: Config, spec: Spec, rng: Generator, sees: Literal["local", "central"]) -> None:
         self.cfg, self.spec, self.rng = cfg, spec, rng
-        sizes, encoder = Sizes.of(spec), ENCODERS[cfg.encoder]
+        sizes, shapes = Sizes.of(spec), encoder(cfg.encoder)
 
         def learner(make: Callable[..., nn.Module], out: int, gain: float) -> Learner[nn.Module]:
             net = team(lambda: orthogonal(make(sizes, cfg.hidden_dim, out), gain), spec.agents, share=cfg.share)
             return Learner(net.to(rng.device), lr=cfg.lr, tau=0.0, max_grad_norm=cfg.max_grad_norm)
 
-        self.actor = learner(encoder.local, spec.actions, POLICY_GAIN)
-        self.critic = learner(encoder.central if sees == "central" else encoder.local, 1, 1.0)
+        self.actor = learner(shapes.local, spec.actions, POLICY_GAIN)
+        self.critic = learner(shapes.central if sees == "central" else shapes.local, 1, 1.0)
         self.objective: Objective = OBJECTIVES[cfg.objective](cfg, rng.device)
         self.standardiser = Standardiser(cfg.standardise, rng.device)
         self.rollout = Rollout(cfg.n_steps, rng.device)
@@ -134,8 +145,10 @@ class PPO:
     def act(self, obs: Obs, carry: Carry, rng: Generator, *, explore: bool) -> tuple[Tensor, Carry, Batch]:
         """The likeliest action (B, N), or one drawn from the policy when exploring; and that policy."""
         policy = self._policy(obs).detach()
-        noisy = policy + gumbel(policy.shape, rng) if explore else policy
-        return noisy.argmax(-1), carry, {"policy": policy}
+        return self._drawn(policy, rng, explore=explore), carry, {"policy": policy}
+
+    def _drawn(self, policy: Tensor, rng: Generator, *, explore: bool) -> Tensor:
+        return (policy + gumbel(policy.shape, rng) if explore else policy).argmax(-1)
 
     # Learning
 
@@ -153,7 +166,7 @@ class PPO:
         for part in self._minibatches(rows):
             logs |= self._improve(part) | self._learn_value(part)
         with torch.no_grad():
-            logs["kl"] = kl(rows["policy"], self._policy(unpack(rows))).mean()
+            logs["kl"] = kl(rows["policy"], self._policies(rows)).mean()
         self.objective.adapt(logs["kl"])
         return logs
 
@@ -161,6 +174,11 @@ class PPO:
     def _judged(self, rows: Batch) -> tuple[Batch, Batch]:
         """Rows (T B, ...) with normalised advantages and the critic's targets, (T B, N) both."""
         value, next_values = values(lambda obs: self.standardiser.value(self._value(obs)), rows)
+        kept, logs = self._aims(rows, value, next_values)
+        return flat(kept), logs
+
+    def _aims(self, rows: Batch, value: Tensor, next_values: Tensor) -> tuple[Batch, Batch]:
+        """The same (T, B, ...) from values of every step and of what follows it, (T, B, N) both."""
         reward = self.standardiser.reward(rows["reward"]).unsqueeze(-1)  # the team's, to every agent
         terminated, done = rows["terminated"].unsqueeze(-1), rows["done"].unsqueeze(-1)
         advantage = gae(reward, value, next_values, terminated, done, self.cfg.gamma, self.cfg.gae_lambda)
@@ -168,7 +186,7 @@ class PPO:
         self.standardiser.update_returns(target)
         kept = {key: rows[key] for key in ("agents", "pairs", "peers", "action", "policy")}
         kept |= {"advantage": normalised(advantage), "target": self.standardiser.target(target)}
-        return flat(kept), {"value": value.mean(), "explained": 1 - advantage.var() / target.var()}
+        return kept, {"value": value.mean(), "explained": 1 - advantage.var() / target.var()}
 
     def _minibatches(self, rows: Batch) -> Iterable[Batch]:
         """Every row once per epoch; without a draw where a pass is one update."""
@@ -177,15 +195,21 @@ class PPO:
         return minibatches(rows, self.cfg.epochs, self.cfg.minibatches, self.rng)
 
     def _improve(self, rows: Batch) -> Batch:
-        policy = self._policy(unpack(rows))
+        policy = self._policies(rows)
         loss = self.objective(policy, rows["policy"], rows["action"], rows["advantage"]).mean()
         entropy = -(policy.exp() * policy).sum(-1).mean()
         norm = self.actor.update(loss - self.cfg.ent_coef * entropy)
         return {"policy_loss": loss, "entropy": entropy, "grad_norm": norm}
 
     def _learn_value(self, rows: Batch) -> Batch:
-        loss = huber_loss(self._value(unpack(rows)), rows["target"], delta=self.cfg.huber)
+        loss = huber_loss(self._predicted(rows), rows["target"], delta=self.cfg.huber)
         return {"value_loss": loss, "critic_grad_norm": self.critic.update(loss)}
+
+    def _policies(self, rows: Batch) -> Tensor:
+        return self._policy(unpack(rows))
+
+    def _predicted(self, rows: Batch) -> Tensor:
+        return self._value(unpack(rows))
 
     def _policy(self, obs: Obs) -> Tensor:
         """Logarithm of the probability of each action: (B, N, actions)."""

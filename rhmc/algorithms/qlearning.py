@@ -2,30 +2,41 @@
 
 The mixer turns the values of the chosen actions, (B, N), into (B, K) values that are learned towards the team's reward:
 itself (IQL, K = N), their sum (VDN, K = 1), a monotone function of them (QMIX, K = 1). Double Q: the network chooses
-the next action, the target network values it.
+the next action, the target network values it. With memory: `rhmc.algorithms.recurrent_qlearning`.
 """
 
+from typing import Self
+
 import torch
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch import Generator, Tensor, nn
 from torch.nn.functional import mse_loss
 
 from rhmc.learning import checkpoint
 from rhmc.learning.experience import Experience
 from rhmc.learning.learner import Learner, Learners, pack_step, taken, unpack
+from rhmc.learning.memory import Recurrent
 from rhmc.learning.normalisation import Standardiser
 from rhmc.learning.schedules import linear
 from rhmc.learning.settings import OffPolicy, Standardised, TargetNetworks
-from rhmc.networks.nets import ENCODERS, Sizes, team
+from rhmc.networks.nets import Sizes, team
+from rhmc.networks.recurrent import encoder
 from rhmc.types import Batch, Carry, Obs, Spec, State, Transition
 
 
-class Config(TargetNetworks, Standardised, OffPolicy):
+class Config(Recurrent, TargetNetworks, Standardised, OffPolicy):
     """Settings; lr and gamma are the paper's."""
 
     double_q: bool = Field(True, description="double Q; false: the target network chooses too")
     epsilon_end: float = Field(0.05, ge=0, le=1)
     epsilon_steps: int = Field(50_000, ge=1)
+
+    @model_validator(mode="after")
+    def _whole_segments(self) -> Self:
+        self.need_segments("batch_size")
+        if self.remembers and self.buffer_size < self.segment_length:
+            raise ValueError(f"buffer_size: must be at least segment_length, {self.segment_length}")
+        return self
 
 
 class Values(nn.Module):
@@ -48,8 +59,8 @@ class QLearning:
 
     def __init__(self, cfg: Config, spec: Spec, rng: Generator, mixer: nn.Module) -> None:
         self.cfg, self.spec, self.rng = cfg, spec, rng
-        sizes, encoder = Sizes.of(spec), ENCODERS[cfg.encoder]
-        agents = team(lambda: encoder.local(sizes, cfg.hidden_dim, spec.actions), spec.agents, share=cfg.share)
+        sizes, shapes = Sizes.of(spec), encoder(cfg.encoder)
+        agents = team(lambda: shapes.local(sizes, cfg.hidden_dim, spec.actions), spec.agents, share=cfg.share)
         self.q = Learner(Values(agents, mixer).to(rng.device), lr=cfg.lr, tau=cfg.tau, max_grad_norm=cfg.max_grad_norm)
         self.standardiser = Standardiser(cfg.standardise, rng.device)
         self.experience = Experience(cfg, cfg.batch_size, rng)
@@ -63,12 +74,13 @@ class QLearning:
     def act(self, obs: Obs, carry: Carry, rng: Generator, *, explore: bool) -> tuple[Tensor, Carry, Batch]:
         """Greedy action (B, N), or epsilon-greedy when exploring."""
         action = self.q.net(obs).argmax(-1)
-        if explore:
-            epsilon = linear(1.0, self.cfg.epsilon_end, self.cfg.epsilon_steps, self.experience.steps)
-            random = torch.randint(self.spec.actions, action.shape, generator=rng, device=rng.device)
-            flip = torch.rand(action.shape, generator=rng, device=rng.device) < epsilon
-            action = torch.where(flip, random, action)
-        return action, carry, {}
+        return self._explored(action, rng) if explore else action, carry, {}
+
+    def _explored(self, action: Tensor, rng: Generator) -> Tensor:
+        epsilon = linear(1.0, self.cfg.epsilon_end, self.cfg.epsilon_steps, self.experience.steps)
+        random = torch.randint(self.spec.actions, action.shape, generator=rng, device=rng.device)
+        flip = torch.rand(action.shape, generator=rng, device=rng.device) < epsilon
+        return torch.where(flip, random, action)
 
     # Learning
 
@@ -87,16 +99,22 @@ class QLearning:
         return logs
 
     def _loss(self, rows: Batch) -> tuple[Tensor, Batch]:
-        chosen = self.q.net.mixed(unpack(rows), rows["action"])
+        chosen, following = self._values(rows)
         with torch.no_grad():
-            after = unpack(rows, "next_")
-            best = (self.q.net if self.cfg.double_q else self.q.target_net)(after).argmax(-1)
-            value = self.standardiser.value(self.q.target_net.mixed(after, best))
+            value = self.standardiser.value(following)
             live = (~rows["terminated"]).float().unsqueeze(-1)
             td_target = self.standardiser.reward(rows["reward"]).unsqueeze(-1) + self.cfg.gamma * live * value
             self.standardiser.update_returns(td_target)
         loss = mse_loss(chosen, self.standardiser.target(td_target).expand_as(chosen))
         return loss, {"td_loss": loss, "q": chosen.mean()}
+
+    def _values(self, rows: Batch) -> tuple[Tensor, Tensor]:
+        """Mixed values of the actions taken, and the target network's of the best ones afterwards: (B, K) both."""
+        chosen = self.q.net.mixed(unpack(rows), rows["action"])
+        with torch.no_grad():
+            after = unpack(rows, "next_")
+            best = (self.q.net if self.cfg.double_q else self.q.target_net)(after).argmax(-1)
+            return chosen, self.q.target_net.mixed(after, best)
 
     def learners(self) -> Learners:
         """The values."""

@@ -12,9 +12,10 @@ from typing import Literal
 from pydantic import Field
 from torch import Generator
 
-from rhmc.algorithms import qlearning
+from rhmc.algorithms import qlearning, recurrent_qlearning
 from rhmc.algorithms.base import About, Method, register_method
-from rhmc.networks.nets import ENCODERS, Sizes
+from rhmc.networks.nets import Sizes
+from rhmc.networks.recurrent import encoder
 from rhmc.types import Spec
 
 ABOUT = About(
@@ -37,8 +38,8 @@ class Config(qlearning.Config):
 
 def build(cfg: Config, spec: Spec, num_envs: int, rng: Generator) -> qlearning.QLearning:
     """The learner."""
-    mixer = ENCODERS[cfg.encoder].mixer(Sizes.of(spec), cfg.hidden_dim, cfg.mixing_embed_dim)
-    return qlearning.QLearning(cfg, spec, rng, mixer)
+    mixer = encoder(cfg.encoder).mixer(Sizes.of(spec), cfg.hidden_dim, cfg.mixing_embed_dim)
+    return recurrent_qlearning.learner(cfg, spec, rng, mixer)
 
 
 register_method("qmix", Method(Config, build, ABOUT))

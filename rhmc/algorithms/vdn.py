@@ -9,7 +9,7 @@ from typing import Literal
 
 from torch import Generator, Tensor, nn
 
-from rhmc.algorithms import qlearning
+from rhmc.algorithms import qlearning, recurrent_qlearning
 from rhmc.algorithms.base import About, Method, register_method
 from rhmc.types import Obs, Spec
 
@@ -39,7 +39,7 @@ class Sum(nn.Module):
 
 def build(cfg: Config, spec: Spec, num_envs: int, rng: Generator) -> qlearning.QLearning:
     """The learner."""
-    return qlearning.QLearning(cfg, spec, rng, Sum())
+    return recurrent_qlearning.learner(cfg, spec, rng, Sum())
 
 
 register_method("vdn", Method(Config, build, ABOUT))

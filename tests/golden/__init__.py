@@ -59,6 +59,9 @@ def cases() -> dict[str, Callable[[], str]]:
     kinds = {kind: {"kind": kind} for kind in ALGORITHMS} | VARIANTS
     found = {f"{name} in {task}": _training(task, algo) for name, algo in kinds.items() for task in ENVS}
     found["maddpg in continuous navigation"] = _training("navigation", {"kind": "maddpg"}, continuous=True)
+    found["iql gru in coverage"] = _training("coverage", {"kind": "iql", "encoder": "pairwise_gru"})
+    mappo = {"kind": "mappo", "encoder": "mlp_gru", "segment_length": 5}
+    found["mappo gru in navigation"] = _training("navigation", mappo)
     found |= {f"yardsticks of {task}": _yardsticks(task) for task in ENVS}
     return found | {"exported table": _table}
 
