@@ -16,7 +16,7 @@ from rhmc.types import Batch, Frozen, Metrics, State, Transition
 class Config(Frozen):
     """Budget and evaluation of a run; all steps are environment steps, summed over the parallel copies."""
 
-    steps: int = Field(5_000_000, ge=1)
+    steps: int = Field(5_000_000, ge=1, description="budget: environment steps of the run")
     num_envs: int = Field(128, ge=1, description="parallel copies; part of a run's identity, trajectories depend on it")
     bootstrap_on_truncation: bool = Field(
         True, description="for every method, the time limit is a truncation (bootstrap); false: a termination"
@@ -25,10 +25,10 @@ class Config(Frozen):
         1.0, ge=0, le=1, description="share of every step size that is left at the end of the budget (linear)"
     )
     evaluations: int = Field(100, ge=1, description="points of the curve after the one at step 0")
-    eval_episodes: int = Field(100, ge=1)
-    final_episodes: int = Field(500, ge=1)
+    eval_episodes: int = Field(100, ge=1, description="evaluation episodes of each point of the curve")
+    final_episodes: int = Field(500, ge=1, description="evaluation episodes after the last point")
     eval_seed: int = Field(10_000_000, ge=0, description="names the evaluation episodes")
-    device: str = "cpu"
+    device: str = Field("cpu", description="device of networks and environments: cpu, cuda or cuda:N")
     threads: int = Field(1, ge=1, description="torch threads; results of larger layers depend on it")
 
 
