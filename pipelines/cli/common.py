@@ -16,6 +16,8 @@ from pipelines.workspace.errors import InputError, visible, visible_lines
 
 if TYPE_CHECKING:
     from pipelines.specs.document import Node
+    from pipelines.specs.initial import Policy
+    from pipelines.specs.search import Search
     from pipelines.specs.study import Study
 
 Loaded = TypeVar("Loaded")
@@ -152,7 +154,26 @@ def load_study(file: Path, profile: str, overrides: Sequence[str] | None, varian
     """
     from pipelines.specs.study import Study
 
-    return Study.load(file, profile, overrides or [], variant)
+    return Study.load(file, profile, overrides or [], variant, find=_find)
+
+
+def _find(address: str, folder: Path) -> "Policy":
+    """Look for a policy that a run of a study starts from."""
+    from pipelines.tracking.initial import finder
+    from pipelines.workspace.work_folder import work_folder
+
+    return finder(work_folder())(address, folder)
+
+
+def load_search(file: Path, profile: str, overrides: Sequence[str] | None) -> "Search":
+    """The search that the options name.
+
+    Raises:
+        InputError: with every fault.
+    """
+    from pipelines.specs.search import Search
+
+    return Search.load(file, profile, overrides or [], find=_find)
 
 
 def load_studies(

@@ -1,6 +1,5 @@
 """One episode of a policy as a small animation, beside policies without learning and a bound if wanted."""
 
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,16 +10,15 @@ from torch import Generator, Tensor
 from pipelines.policies.animation import Panel, Scene, gif
 from pipelines.specs.document import choices
 from pipelines.tracking import policy
+from pipelines.tracking.policy_address import saved_at
 from pipelines.workspace.errors import InputError
-from pipelines.workspace.leftovers import scratch
-from pipelines.workspace.work_folder import Home, StoreError, whole
+from pipelines.workspace.work_folder import Home, whole
 from rhmc.envs import ENVS, EnvConfig, coverage
 from rhmc.yardsticks import POLICIES, offered
 from rhmc.yardsticks.coverage import windows
 from rhmc.yardsticks.joint import best_choice
 
 FRAMES, MILLISECONDS = 40, 110
-RUN = re.compile(r"[0-9a-f]{32}")  # how MLflow names a run
 
 FREE = "free_heading_bound"  # a bound that can be shown: sensors that take any heading at once
 Act = Callable[[Any], tuple[Tensor, Tensor | None]]  # state -> action (1, N[, A]) and assignment (1, N, M) if any
@@ -150,31 +148,10 @@ def render(
     """
     if out.is_dir() or not out.parent.is_dir():
         raise InputError(f"--out: {out} is a folder" if out.is_dir() else f"--out: {out.parent} is no folder")
-    saved = what if isinstance(what, policy.Saved) else _saved(what, home)
+    saved = what if isinstance(what, policy.Saved) else saved_at(what, home)
     torch.set_num_threads(saved.spec.trainer.threads)  # the actions of larger layers depend on it
     write(out, episode_gif(saved, episode, beside, frames))
     return out
-
-
-def _saved(what: str, home: Home) -> policy.Saved:
-    path = Path(what)
-    if path.exists() or not RUN.fullmatch(what):
-        return policy.load(path)
-    with scratch() as folder:
-        return policy.load(_fetch(what, home, Path(folder)))
-
-
-def _fetch(ref: str, home: Home, folder: Path) -> Path:
-    """The files of a run in the log, in a folder."""
-    from pipelines.tracking.mlflow_tracker import fetch  # 3 s
-
-    try:
-        found = fetch(ref, [policy.FILE, policy.CONFIG], home, folder)
-    except StoreError as error:
-        raise InputError(str(error)) from error
-    if policy.FILE not in found:
-        raise InputError(f"run {ref} keeps no {policy.FILE}: it is not finished, or the file is gone")
-    return folder
 
 
 def write(path: Path, content: bytes) -> None:

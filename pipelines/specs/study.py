@@ -36,6 +36,7 @@ from pipelines.specs.document import (
 )
 from pipelines.specs.grid import MOST, Point, nested, points, replaced
 from pipelines.specs.include import included
+from pipelines.specs.initial import FIELD, Find, Starts, addresses, nowhere
 from pipelines.specs.plugins import configs
 from pipelines.specs.readings import NOTHING, Cell, Plan, ProfileReadings, Reading, Readings, Spelled, spelled
 from pipelines.specs.safe_names import ARM, PROFILES, alike, fault_of_study, simple, study_name, too_long
@@ -173,11 +174,19 @@ class Study(Frozen):
     variant: str = ""
     readings: Plan | None = None
     cells: dict[str, Cell] = Field(default_factory=dict)  # by arm, where the study has readings
-    remarks: tuple[str, ...] = ()  # what is allowed and gives nothing: arms whose budget ends before they learn
+    remarks: tuple[
+        str, ...
+    ] = ()  # arms whose budget ends before they learn; what the policies are that runs start from
+    policies: dict[str, str] = Field(default_factory=dict)  # by digest, where those were found that runs start from
 
     @classmethod
     def load(
-        cls, path: Path | str, profile: str = "quick", overrides: Sequence[str] = (), variant: str | None = None
+        cls,
+        path: Path | str,
+        profile: str = "quick",
+        overrides: Sequence[str] = (),
+        variant: str | None = None,
+        find: Find = nowhere,
     ) -> Self:
         """Read, merge and check a study.
 
@@ -189,11 +198,12 @@ class Study(Frozen):
                 on, and `trainer.steps` for `steps`. They go before a profile's changes of the base;
                 an arm keeps what it states, or the profile for it.
             variant: one of the file's `variants`; None for the arms as they stand.
+            find: looks for the policies that `trainer.init` names.
 
         Raises:
             StudyError: with every fault found.
         """
-        loaded = load_layers(Path(path), File, profile, overrides, COUNTS, gridded=GridFile, variant=variant)
+        loaded = load_layers(Path(path), File, profile, overrides, COUNTS, gridded=GridFile, variant=variant, find=find)
         file, wanted = loaded.file, loaded.wanted
         if loaded.faults or file is None or wanted.base is None:
             raise StudyError(_no_study(loaded.root) or loaded.faults)
@@ -202,7 +212,8 @@ class Study(Frozen):
         fixed |= {"file": str(path), "overrides": tuple(overrides), "variant": variant or ""}
         name = study_name(Path(path), variant or "")
         fixed |= {"readings": wanted.readings, "cells": wanted.cells}
-        fixed["remarks"] = tuple(map(str, dict.fromkeys(wanted.remarks)))
+        fixed["remarks"] = tuple(map(str, dict.fromkeys([*wanted.remarks, *loaded.starts.remarks])))
+        fixed["policies"] = addresses(loaded.starts.found)
         return cls(name=name, base=wanted.base, arms=wanted.arms, **fixed, **resolved)
 
     def runs(self) -> list[PlannedRun]:
@@ -330,6 +341,7 @@ class Loaded(NamedTuple, Generic[M]):
     root: Node
     wanted: Resolved
     faults: list[Fault]
+    starts: Starts
 
 
 def load_layers(
@@ -341,6 +353,7 @@ def load_layers(
     *,
     gridded: type[M] | None = None,
     variant: str | None = None,
+    find: Find = nowhere,
 ) -> Loaded[M]:
     """Read, merge and check what all files with arms have in common.
 
@@ -352,6 +365,7 @@ def load_layers(
         counts: names of the fields that hold a number for each profile.
         gridded: its shape where it has a grid.
         variant: one of its `variants`; None for the arms as they stand.
+        find: see `Study.load`.
 
     Raises:
         StudyError: there is no mapping to go on with, or a module that it imports cannot be used.
@@ -362,16 +376,20 @@ def load_layers(
     if found := plugins.imported(root.children.get(IMPORTS), path.parent):
         raise StudyError([*faults, *found])
     plugins.discover()
+    starts = Starts(path.parent, find)  # after what is imported, of which a policy may be
+    whole = [starts.named(tree) for tree in (root, *patches)]
+    root, patches = whole[0][0], [tree for tree, _ in whole[1:]]
+    unnamed = list(dict.fromkeys(fault for _, found in whole for fault in found))
     file, structure = validate(gridded if gridded and "grid" in root.children else model, root)
     known = root._replace(value={key: child for key, child in root.children.items() if key in model.model_fields})
     variants = _group(known, "variants")
-    resolved = {(p, v): _settings(known, p, v, patches) for p in PROFILES for v in (None, *variants)}
-    faults += structure + _variant_faults(path, variants, variant)
+    resolved = {(p, v): _settings(known, p, v, patches, starts) for p in PROFILES for v in (None, *variants)}
+    faults += structure + unnamed + _variant_faults(path, variants, variant)
     # An arm that is wrong in its shape resolves to the base: that it is the same as another is no news then.
-    faults += [f for one in resolved.values() for f in one.faults if not (structure and TWIN in f.text)]
+    faults += [f for one in resolved.values() for f in one.faults if not ((structure or unnamed) and TWIN in f.text)]
     if file is not None and profile in PROFILES:
         faults += [f for name in counts for f in _no_value(root, name, profile)]
-    return Loaded(file, root, resolved.get((profile, variant)) or resolved[PROFILES[0], None], faults)
+    return Loaded(file, root, resolved.get((profile, variant)) or resolved[PROFILES[0], None], faults, starts)
 
 
 def _trees(
@@ -479,7 +497,7 @@ def _with_design(node: Node) -> Node:
     return node._replace(value=node.children | {"readings": block})
 
 
-def _settings(root: Node, profile: str, variant: str | None, patches: Sequence[Node]) -> Resolved:
+def _settings(root: Node, profile: str, variant: str | None, patches: Sequence[Node], starts: Starts) -> Resolved:
     """Resolve the base and every arm for a profile. Overrides of the base go before what the profile changes in it."""
     chosen = _child(_child(root, "profiles"), profile)
     layers = [root.children.get("base"), chosen, *(_child(patch, "base") for patch in patches)]
@@ -487,7 +505,7 @@ def _settings(root: Node, profile: str, variant: str | None, patches: Sequence[N
     common = [reduce(merge, stated)] if stated else []
     last = [layer for layer in [_child(_child(root, "variants"), variant or "")] if layer]
     steps = _child(_child(root, "steps"), profile)
-    base, faults = _setting([*common, *last] if common else [], steps)
+    base, faults = _setting([*common, *last] if common else [], steps, starts)
     planned, plan, found = _planned(root, chosen, patches)
     faults += found + [fault for layer in last for fault in _unstated(common[0] if common else None, layer)]
     arms: dict[str, Setting] = {}
@@ -495,7 +513,7 @@ def _settings(root: Node, profile: str, variant: str | None, patches: Sequence[N
     owners: dict[Fault, list[str]] = {}
     for name, (written, arm, reading) in planned.items():
         faults += _unstated(common[0] if common else None, arm)
-        setting, found = _setting([*common, arm, *last], steps)
+        setting, found = _setting([*common, arm, *last], steps, starts)
         for fault in set(found) - set(faults):
             owners.setdefault(fault, []).append(written)
         if setting is not None:
@@ -592,7 +610,7 @@ def _group(root: Node, key: str) -> dict[str, Node]:
     return group.children if group else {}
 
 
-def _setting(layers: Sequence[Node], steps: Node | None) -> tuple[Setting | None, list[Fault]]:
+def _setting(layers: Sequence[Node], steps: Node | None, starts: Starts) -> tuple[Setting | None, list[Fault]]:
     parts, faults = {}, []
     for section in SECTIONS:
         node = _section(layers, section)
@@ -603,7 +621,7 @@ def _setting(layers: Sequence[Node], steps: Node | None) -> tuple[Setting | None
     if not complete or faults:
         return None, faults
     setting = Setting(**parts)
-    faults = _misfit(setting, layers)
+    faults = _misfit(setting, layers) or _no_start(setting, layers, starts)
     return (None if faults else setting), faults
 
 
@@ -616,6 +634,13 @@ def _misfit(setting: Setting, layers: Sequence[Node]) -> list[Fault]:
     env = _section(layers, "env")
     node = _child(env, field) or env
     return [Fault(node.place, node.path, fault)] if node else []
+
+
+def _no_start(setting: Setting, layers: Sequence[Node], starts: Starts) -> list[Fault]:
+    """A policy from which the run cannot start, at the place where it is named."""
+    node = _child(_section(layers, "trainer"), FIELD)
+    text = starts.misfit(setting) if node else ""
+    return [Fault(node.place, node.path, text)] if node and text else []
 
 
 def _section(layers: Sequence[Node], name: str) -> Node | None:

@@ -52,7 +52,7 @@ def tried(allowed: str) -> list[tuple[Any, bool]]:
     if allowed == "true, false":
         return [(True, True), (False, True), ("perhaps", False)]
     if not allowed.startswith(("number", "whole number")):
-        words = allowed.split(", ") if allowed not in ("list", "text") else []
+        words = allowed.split(", ") if allowed not in ("list", "text", "text or null") else []
         return [(word, True) for word in words] + ([("no such word", False)] if words else [])
     values: list[tuple[Any, bool]] = [("many", False)]
     if "at least" in allowed:
