@@ -38,7 +38,8 @@ def files_in(folder: str, pattern: str, incomplete: str) -> list[str]:
     return [str(p) for p in sorted(Path(folder).glob(pattern)) if str(p).startswith(incomplete)]
 
 
-def _studies(incomplete: str) -> list[str]:
+def studies(incomplete: str) -> list[str]:
+    """Completion of a study."""
     return files_in("studies", "*.yaml", incomplete)
 
 
@@ -77,9 +78,9 @@ def _arms(ctx: typer.Context, incomplete: str) -> list[str]:
 
 
 File = Annotated[
-    Path, typer.Argument(metavar="FILE", help="A study, such as studies/ablation.yaml.", autocompletion=_studies)
+    Path, typer.Argument(metavar="FILE", help="A study, such as studies/ablation.yaml.", autocompletion=studies)
 ]
-Files = Annotated[list[Path], typer.Argument(metavar="FILE...", help="Studies.", autocompletion=_studies)]
+Files = Annotated[list[Path], typer.Argument(metavar="FILE...", help="Studies.", autocompletion=studies)]
 Profile = Annotated[str, typer.Option(help="The budget: quick or paper.", autocompletion=_profiles)]
 Variant = Annotated[
     str | None,

@@ -19,11 +19,11 @@ from pipelines.execution.recorder import Recorder
 from pipelines.execution.standing import Standing, by_arm, counted, show
 from pipelines.specs.document import choices
 from pipelines.specs.limits import absent
-from pipelines.specs.source_file import another, remember
 from pipelines.specs.study import Study
 from pipelines.tracking.initial import keep as keep_policies
 from pipelines.tracking.kept_plan import KeptPlan, Options, Place, keep
 from pipelines.tracking.plan import Item, finished, given_twice, items, read_commit, study_card
+from pipelines.tracking.source_file import another, remember
 from pipelines.tracking.staleness import stale_lines, stale_runs
 from pipelines.tracking.tracker import Tracker
 from pipelines.workspace.addresses import without_password

@@ -8,6 +8,7 @@ import torch
 from torch import Generator, Tensor
 
 from pipelines.policies.animation import Panel, Scene, gif
+from pipelines.policies.evaluation import EvaluationEpisodes, Policy, acting, task
 from pipelines.specs.document import choices
 from pipelines.tracking import policy
 from pipelines.tracking.policy_address import saved_at
@@ -20,6 +21,7 @@ from rhmc.yardsticks.joint import best_choice
 
 FRAMES, MILLISECONDS = 40, 110
 
+OWN = EvaluationEpisodes()  # those of the run itself
 FREE = "free_heading_bound"  # a bound that can be shown: sensors that take any heading at once
 Act = Callable[[Any], tuple[Tensor, Tensor | None]]  # state -> action (1, N[, A]) and assignment (1, N, M) if any
 
@@ -109,7 +111,13 @@ def _words(name: str, value: float) -> str:
     return f"return {value:.1f}" if name == "return" else f"{name.replace('_', ' ')} {value:.2f}"
 
 
-def episode_gif(saved: policy.Saved, episode: int = 0, beside: str | None = None, frames: int = FRAMES) -> bytes:
+def episode_gif(
+    saved: policy.Saved,
+    episode: int = 0,
+    beside: str | None = None,
+    frames: int = FRAMES,
+    wanted: EvaluationEpisodes = OWN,
+) -> bytes:
     """An episode of a trained policy as a GIF.
 
     Args:
@@ -117,17 +125,15 @@ def episode_gif(saved: policy.Saved, episode: int = 0, beside: str | None = None
         episode: names the start and the target motion.
         beside: also policies without learning, or `FREE`, in the same episode: names with commas between.
         frames: at most so many.
+        wanted: other numbers of agents and targets; how many episodes it says does not matter here.
 
     Raises:
-        InputError: no such policy, or a state that this code cannot load.
+        InputError: no such policy or task, or a state that this code cannot load.
     """
-    env = saved.spec.env
+    env = task(saved.spec.env, wanted)
     names = [name.strip() for name in beside.split(",")] if beside else []
     others = [Panel(f"{name.replace('_', ' ')}, episode {episode}", panel(env, name, episode)) for name in names]
-    try:
-        actor = policy.Actor(saved)
-    except ValueError as error:
-        raise InputError(f"the policy cannot be used: {error}") from error
+    actor = acting(Policy(saved.spec.algo.kind, saved), env)
     own = f"{saved.spec.algo.kind}, seed {saved.spec.seed}, episode {episode}"
     return gif(env, [Panel(own, play(env, trained(actor), episode)), *others], frames, MILLISECONDS)
 
@@ -139,8 +145,9 @@ def render(
     episode: int = 0,
     beside: str | None = None,
     frames: int = FRAMES,
+    wanted: EvaluationEpisodes = OWN,
 ) -> Path:
-    """Write the animation of a policy, of a run, by its id in MLflow, or of a checkpoint, by its path.
+    """Write the animation of a policy, or of one by its address (`pipelines.tracking.policy_address`).
 
     Raises:
         InputError: what is given cannot be used; nothing is written.
@@ -150,7 +157,7 @@ def render(
         raise InputError(f"--out: {out} is a folder" if out.is_dir() else f"--out: {out.parent} is no folder")
     saved = what if isinstance(what, policy.Saved) else saved_at(what, home)
     torch.set_num_threads(saved.spec.trainer.threads)  # the actions of larger layers depend on it
-    write(out, episode_gif(saved, episode, beside, frames))
+    write(out, episode_gif(saved, episode, beside, frames, wanted))
     return out
 
 

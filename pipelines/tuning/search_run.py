@@ -22,9 +22,9 @@ from pipelines.execution.ray_settings import set_up_ray
 from pipelines.execution.run import Interrupts, guarded, missing_devices
 from pipelines.execution.tally import Ended, Tally, Training
 from pipelines.specs.search import Search
-from pipelines.specs.source_file import another, remember
 from pipelines.tracking.initial import keep as keep_policies
 from pipelines.tracking.plan import read_commit
+from pipelines.tracking.source_file import another, remember
 from pipelines.tracking.tracker import Card, RunLog, Status, StudyCard, Tracker
 from pipelines.tuning.best_params import file_name, stem, winner_yaml, write_text
 from pipelines.tuning.trials import OBJECTIVE, ArmStudy, BaseStorage, TrialRequest, explained, look, opened, storage_url
