@@ -134,6 +134,7 @@ class File(Frozen):
     """A search's file."""
 
     question: str = Field(min_length=1)
+    preset: Literal["tuned", "paper"] | None = None
     base: Base
     arms: dict[str, SearchArm] = Field(min_length=1)
     trials: Counts
@@ -217,8 +218,8 @@ class Search(Frozen):
         counts = {name: getattr(getattr(file, name), profile) for name in COUNTS}
         parts = {name: getattr(file, name) for name in ("sampler", "pruner", "resources")}
         names = {"name": study_name(path), "profile": profile, "file": str(path)}
-        remarks = tuple(map(str, dict.fromkeys([*loaded.wanted.remarks, *loaded.starts.remarks])))
-        told = {"overrides": tuple(overrides), "remarks": remarks, "policies": addresses(loaded.starts.found)}
+        remarks = tuple(map(str, dict.fromkeys(loaded.wanted.remarks)))
+        told = {"overrides": tuple(overrides), "remarks": remarks, "policies": addresses(loaded.policies)}
         digest = hashlib.sha256(b"".join(file.read_bytes() for file in closure(path))).hexdigest()
         return cls(question=file.question.strip(), arms=arms, sha256=digest, **names, **told, **counts, **parts)
 
