@@ -21,7 +21,7 @@ from pipelines.specs.document import Fault, Node, Unreadable, settings, show
 from pipelines.workspace.errors import InputError
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import ENVS
-from rhmc.learning.initial import fresh, started
+from rhmc.learning.initial import started
 from rhmc.types import Spec, State
 
 if TYPE_CHECKING:
@@ -29,10 +29,8 @@ if TYPE_CHECKING:
 
 SECTION, FIELD = "trainer", "init"
 DIGEST = re.compile(r"[0-9a-f]{16}")  # what a run keeps, `rhmc.training.trainer.Config.init`
-SAME = (
-    "encoder",
-    "standardise",
-)  # settings of a method, in whatever block, without which its numbers mean other things
+# Settings of a method, in whatever block, without which its numbers mean other things.
+SAME = ("encoder", "standardise")
 
 
 class Policy(NamedTuple):
@@ -123,11 +121,6 @@ def misfit(policy: Policy, setting: "Setting") -> str:
         others = ", ".join(_differing(policy.setting, setting)) or "none"
         return f"the policy does not fit: {error}; settings that differ: {others}"
     return ""
-
-
-def drawn(policy: Policy, setting: "Setting") -> list[str]:
-    """The networks of a run that its policy does not have."""
-    return fresh(_state(setting), policy.state)
 
 
 def _compared(its: "Setting", own: "Setting") -> Iterator[tuple[str, Any, Any]]:

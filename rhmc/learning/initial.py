@@ -40,12 +40,6 @@ def started(state: State, policy: State) -> State:
     return _over(state, given, "")
 
 
-def fresh(state: State, policy: State) -> list[str]:
-    """The networks of a method, by dotted name, that a policy does not have, and that are drawn."""
-    own, given = _networks(learned(state)), set(_networks(learned(policy)))
-    return [name for name in own if name not in given]
-
-
 def _of_learner(state: State) -> bool:
     parts = {NET, TARGET, OPTIMISER}
     return NET in state and state.keys() <= parts and _tensors(state[NET])
@@ -53,12 +47,6 @@ def _of_learner(state: State) -> bool:
 
 def _tensors(part: Any) -> bool:
     return isinstance(part, dict) and all(isinstance(value, Tensor) for value in part.values())
-
-
-def _networks(parts: State, at: str = "") -> list[str]:
-    if NET in parts:
-        return [at.removesuffix(".")]
-    return [name for key, part in parts.items() if isinstance(part, dict) for name in _networks(part, f"{at}{key}.")]
 
 
 def _over(own: Any, given: State, at: str) -> State:
