@@ -16,6 +16,8 @@ from pipelines.workspace.errors import InputError, visible, visible_lines
 
 if TYPE_CHECKING:
     from pipelines.specs.document import Node
+    from pipelines.specs.initial import Policy
+    from pipelines.specs.search import Search
     from pipelines.specs.study import Study
 
 Loaded = TypeVar("Loaded")
@@ -36,7 +38,8 @@ def files_in(folder: str, pattern: str, incomplete: str) -> list[str]:
     return [str(p) for p in sorted(Path(folder).glob(pattern)) if str(p).startswith(incomplete)]
 
 
-def _studies(incomplete: str) -> list[str]:
+def studies(incomplete: str) -> list[str]:
+    """Completion of a study."""
     return files_in("studies", "*.yaml", incomplete)
 
 
@@ -75,9 +78,9 @@ def _arms(ctx: typer.Context, incomplete: str) -> list[str]:
 
 
 File = Annotated[
-    Path, typer.Argument(metavar="FILE", help="A study, such as studies/ablation.yaml.", autocompletion=_studies)
+    Path, typer.Argument(metavar="FILE", help="A study, such as studies/ablation.yaml.", autocompletion=studies)
 ]
-Files = Annotated[list[Path], typer.Argument(metavar="FILE...", help="Studies.", autocompletion=_studies)]
+Files = Annotated[list[Path], typer.Argument(metavar="FILE...", help="Studies.", autocompletion=studies)]
 Profile = Annotated[str, typer.Option(help="The budget: quick or paper.", autocompletion=_profiles)]
 Variant = Annotated[
     str | None,
@@ -152,7 +155,26 @@ def load_study(file: Path, profile: str, overrides: Sequence[str] | None, varian
     """
     from pipelines.specs.study import Study
 
-    return Study.load(file, profile, overrides or [], variant)
+    return Study.load(file, profile, overrides or [], variant, find=_find)
+
+
+def _find(address: str, folder: Path) -> "Policy":
+    """Look for a policy that a run of a study starts from."""
+    from pipelines.tracking.initial import finder
+    from pipelines.workspace.work_folder import work_folder
+
+    return finder(work_folder())(address, folder)
+
+
+def load_search(file: Path, profile: str, overrides: Sequence[str] | None) -> "Search":
+    """The search that the options name.
+
+    Raises:
+        InputError: with every fault.
+    """
+    from pipelines.specs.search import Search
+
+    return Search.load(file, profile, overrides or [], find=_find)
 
 
 def load_studies(

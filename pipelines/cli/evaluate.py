@@ -1,7 +1,8 @@
 """Trained policies looked at again: in evaluation episodes, with other numbers of agents, and what they assign."""
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -14,26 +15,80 @@ from pipelines.cli.common import (
     Variant,
     folder_option,
     load_study,
+    say,
     say_json,
+    studies,
     table,
     tell,
 )
 from pipelines.specs.limits import BOUNDS, EPISODES, JOBS, SEED
 from pipelines.workspace.errors import InputError
 
-CHECKPOINT = ".pt"
+if TYPE_CHECKING:
+    from pipelines.policies.evaluation import Policy, Score
+
+WHAT = (
+    "A study, whose finished runs (or newest checkpoints) are meant; or a policy: a .pt file that a run keeps, a "
+    "folder with one, runs:/ID of a finished run in MLflow, models:/NAME/VERSION."
+)
+What = Annotated[str, typer.Argument(metavar="FILE|POLICY", help=WHAT, autocompletion=studies)]
+Agents = Annotated[int | None, typer.Option(help="Other than the policy was trained with.")]
+Targets = Annotated[int | None, typer.Option(help="Other than the policy was trained with.")]
+Config = Annotated[Path | None, typer.Option(help="Settings of a .pt file, other than it names itself: a config.yaml.")]
+COUNTS, QUOTE = ("agents", "targets"), "'"
 Seeds = Annotated[list[int] | None, typer.Option(min=0, max=SEED, help="Only this seed. Can be given several times.")]
 Out = Annotated[Path, typer.Option(help="Folder of the tables that the report reads; made if it is not there.")]
 
 
+class Asked(NamedTuple):
+    """The options that choose policies."""
+
+    profile: str
+    variant: str | None
+    arms: Sequence[str]
+    seeds: Sequence[int]
+    overrides: Sequence[str]
+    config: Path | None
+
+
+def policies(what: str, asked: Asked) -> "Iterator[Policy]":
+    """The policies of a study's runs, or the one at an address.
+
+    Raises:
+        InputError: there is none, or an option belongs to the other of both.
+    """
+    from pipelines.policies.evaluation import of_address, of_study
+    from pipelines.tracking.policy_address import is_policy
+    from pipelines.workspace.work_folder import StoreError, work_folder
+
+    try:
+        if is_policy(what):
+            of_studies = {
+                "--variant": asked.variant,
+                "--arm": asked.arms,
+                "--seed": asked.seeds,
+                "--set": asked.overrides,
+            }
+            if given := [option for option, value in of_studies.items() if value]:
+                raise InputError(f"{given[0]}: belongs to a study, and {what} is one policy")
+            yield of_address(what, asked.config, work_folder())
+            return
+        if asked.config is not None:
+            raise InputError(f"--config: belongs to a .pt file, and {what} is a study")
+        study = load_study(Path(what), asked.profile, asked.overrides, asked.variant)
+        yield from of_study(study, work_folder(), asked.arms, asked.seeds)
+    except StoreError as error:
+        raise InputError(str(error)) from error
+
+
 def evaluate(
-    file: File,
+    what: What,
     profile: Profile = "quick",
     variant: Variant = None,
     arm: Arms = None,
     seed: Seeds = None,
-    agents: Annotated[int | None, typer.Option(help="Other than the policy was trained with.")] = None,
-    targets: Annotated[int | None, typer.Option(help="Other than the policy was trained with.")] = None,
+    agents: Agents = None,
+    targets: Targets = None,
     episodes: Annotated[
         int | None,
         typer.Option(
@@ -46,32 +101,23 @@ def evaluate(
             min=0, max=SEED, help="Seed of the evaluation episodes; that of the run's final evaluation if not given."
         ),
     ] = None,
-    config: Annotated[
-        Path | None, typer.Option(help="Settings of a .pt file, other than it names itself: a config.yaml.")
-    ] = None,
+    config: Config = None,
     as_json: Json = False,
     overrides: Sets = None,
 ) -> None:
     """Play trained policies greedily: the return with its standard error over the episodes, and the task's metrics.
 
-    FILE is a study, whose finished runs (or newest checkpoints) are played, or a policy: a .pt file that a run keeps.
+    Says in which task they played, and in what that differs from the runs' own final evaluation.
     """
-    from pipelines.policies.evaluation import EvaluationEpisodes, of_file, of_study, score
-    from pipelines.workspace.work_folder import StoreError, work_folder
+    from pipelines.policies.evaluation import EvaluationEpisodes, score
 
     wanted = EvaluationEpisodes(episodes, eval_seed, agents, targets)
-    try:
-        if file.suffix == CHECKPOINT:
-            policies = iter([of_file(file, config)])
-        else:
-            study = load_study(file, profile, overrides, variant)
-            policies = of_study(study, work_folder(), arm or [], seed or [])
-        scores = [score(policy, wanted) for policy in policies]
-    except StoreError as error:
-        raise InputError(str(error)) from error
+    asked = Asked(profile, variant, arm or [], seed or [], overrides or [], config)
+    scores = [score(policy, wanted) for policy in policies(what, asked)]
     if as_json:
         say_json([one._asdict() for one in scores])
         return
+    _say_played(scores)
     columns = list(dict.fromkeys(name for one in scores for name in one.values if name not in ("return", "return_sem")))
     rows = [
         [one.arm, str(one.seed), one.source, str(one.episodes), _with_error(one.values)]
@@ -80,6 +126,26 @@ def evaluate(
     ]
     numbers = ["seed", "episodes", "return", *columns]
     table(["arm", "seed", "policy", "episodes", "return", *columns], rows, numbers=numbers)
+
+
+def _say_played(scores: "Sequence[Score]") -> None:
+    """The tasks that were played, each once, with the arms where they differ."""
+    played: dict[str, dict[str, None]] = {}
+    for one in scores:
+        played.setdefault(_played(one), {})[one.arm] = None
+    for text, arms in played.items():
+        say(text if len(played) == 1 else f"{', '.join(arms)}: {text}")
+
+
+def _played(one: "Score") -> str:
+    from pipelines.specs.document import show
+    from rhmc.envs import ENVS
+
+    usual = ENVS[one.task["kind"]].config().model_dump(mode="json")
+    told = {name: value for name, value in one.task.items() if value != usual[name] or name in COUNTS}
+    settings = ", ".join(f"{name}={show(value).strip(QUOTE)}" for name, value in told.items())
+    changed = ", ".join(f"{name}={show(value).strip(QUOTE)}" for name, value in one.changed.items())
+    return f"{one.task['kind']} ({settings}); other than in the run's own evaluation: {changed or 'nothing'}"
 
 
 def transfer(

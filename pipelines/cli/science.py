@@ -79,7 +79,10 @@ def methods(
             raise InputError("--out: belongs to the table of all methods; leave the method out")
         method = _entry(ALGORITHMS, kind, "method")
         say(f"{method.about.name}: {method.about.source}; {method.about.family}, {method.about.coordination}")
-        _settings(method.config)
+        from pipelines.specs.include import tuned
+        from rhmc.envs import ENVS
+
+        _settings(method.config, {f"tuned, {task}": tuned("algo", task, kind) for task in ENVS})
         return
     with folder_option(out):
         found = describe()
@@ -105,7 +108,9 @@ def tasks(
     if kind is not None:
         config = _entry(ENVS, kind, "task").config
         say(f"{kind}: {_summary(config)}")
-        _settings(config)
+        from pipelines.specs.include import tuned
+
+        _settings(config, {"tuned": tuned("env", kind)})
         return
     sizes = {name: task.physics.spec(task.config()) for name, task in ENVS.items()}
     rows = [
@@ -123,10 +128,19 @@ def _entry(entries: Mapping[str, Entry], kind: str, what: str) -> Entry:
     return entries[kind]
 
 
-def _settings(config: "type[BaseModel]") -> None:
+def _settings(config: "type[BaseModel]", tuned: Mapping[str, Mapping[str, object]]) -> None:
+    """Every setting, with what `preset: tuned` has instead of its default; a column for each task that has any."""
+    from pipelines.specs.document import show
     from pipelines.specs.fields import described
+    from pipelines.tracking.plan import flatten
 
-    table(["setting", "allowed", "default", "meaning"], described(config))
+    found = {name: flatten(dict(values)) for name, values in tuned.items() if values}
+    rows = []
+    for one in described(config):
+        values = [str(show(each[one.name])).strip("'") if one.name in each else "" for each in found.values()]
+        others = ["" if value == one.default else value for value in values]
+        rows.append([one.name, one.allowed, one.default, *others, one.meaning])
+    table(["setting", "allowed", "default", *found, "meaning"], rows)
 
 
 def _summary(config: "type[BaseModel]") -> str:

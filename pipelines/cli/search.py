@@ -7,7 +7,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipelines.cli.common import Folder, Json, Profile, files_in, folder_option, listing, load_each, say, tell
+from pipelines.cli.common import (
+    Folder,
+    Json,
+    Profile,
+    files_in,
+    folder_option,
+    listing,
+    load_each,
+    load_search,
+    say,
+    tell,
+)
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.exit_codes import Exit
 
@@ -113,6 +124,4 @@ def export(
 
 
 def _search(file: Path, profile: str, overrides: Sequence[str] | None) -> "Search":
-    from pipelines.specs.search import Search
-
-    return Search.load(file, profile, overrides or [])
+    return load_search(file, profile, overrides)

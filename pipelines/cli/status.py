@@ -6,7 +6,18 @@ from typing import Any
 
 import typer
 
-from pipelines.cli.common import Folder, Json, Profile, files_of_kind, profile_faults, say_json, studies_folder, table
+from pipelines.cli.common import (
+    Folder,
+    Json,
+    Profile,
+    files_of_kind,
+    load_search,
+    load_study,
+    profile_faults,
+    say_json,
+    studies_folder,
+    table,
+)
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.exit_codes import Exit
 
@@ -41,9 +52,8 @@ def _study(file: Path, profile: str, home: Any) -> dict[str, Any]:
             found = quick[1]
         else:
             from pipelines.execution.run import standing_of
-            from pipelines.specs.study import Study
 
-            found = standing_of(Study.load(file, profile), home)
+            found = standing_of(load_study(file, profile, None, None), home)
     except InputError as error:
         return {"file": str(file), "kind": "study", "state": f"faulty: {error.args[0]}"}
     counts = sum((Counter(one) for one in found.arms.values()), Counter[str]())
@@ -51,11 +61,10 @@ def _study(file: Path, profile: str, home: Any) -> dict[str, Any]:
 
 
 def _search(file: Path, profile: str, home: Any) -> dict[str, Any]:
-    from pipelines.specs.search import Search
     from pipelines.tuning.search_run import standing_of
 
     try:
-        return _row(file, "search", Counter(standing_of(Search.load(file, profile), home)))
+        return _row(file, "search", Counter(standing_of(load_search(file, profile, None), home)))
     except InputError as error:
         return {"file": str(file), "kind": "search", "state": f"faulty: {error.args[0]}"}
 

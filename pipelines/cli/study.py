@@ -38,8 +38,8 @@ app = typer.Typer(help="Check, run, follow and move studies.", no_args_is_help=T
 @app.command("check")
 def check(file: File, profile: Profile = "quick", variant: Variant = None, overrides: Sets = None) -> None:
     """Say what a study would run, or everything that is wrong with it. Starts nothing."""
-    from pipelines.specs.source_file import another
     from pipelines.specs.study import changes
+    from pipelines.tracking.source_file import another
     from pipelines.workspace.work_folder import Home, work_folder
 
     study = load_study(file, profile, overrides, variant)

@@ -8,18 +8,20 @@ says from what it was adopted and what was compared.
 
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 from pipelines.execution.recorder import copy_run
 from pipelines.specs.study import Study
+from pipelines.tracking.initial import begun, keep
 from pipelines.tracking.plan import Item, finished, items, study_card
 from pipelines.tracking.staleness import kept_settings
 from pipelines.tracking.tracker import ADOPTED, FROM, Recorded, Row, StudyCard, Tracker, points_of
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.process_pool import side_by_side
 from pipelines.workspace.work_folder import Home
-from rhmc.training.trainer import Trainer, grid_step
+from rhmc.training.trainer import grid_step
 from rhmc.types import Metrics
 
 OURS = "time/"  # metrics that say how long something took
@@ -84,6 +86,7 @@ def adopt(
 
     place, card, plan = Home(home), study_card(study), items(study)
     place.prepare()
+    keep(study.policies, home)
     with place.lock(study.name, study.profile):
         tracker = MlflowTracker(card, place)
         try:
@@ -91,7 +94,7 @@ def adopt(
             if not found:
                 say("no finished run of other code has the settings of a planned one that is missing")
             proofs = []
-            for proof in prove(found, tracker, verify, until, jobs):
+            for proof in prove(found, tracker, verify, until, jobs, home):
                 proofs.append(proof)
                 _settle(proof, found[proof.arm], card, tracker, say)
             return proofs
@@ -148,7 +151,12 @@ def _settings_id(run: Recorded, tracker: Tracker) -> str:
 
 
 def prove(
-    runs: Mapping[str, Sequence[Older]], tracker: Tracker, verify: int, until: int | None, jobs: int
+    runs: Mapping[str, Sequence[Older]],
+    tracker: Tracker,
+    verify: int,
+    until: int | None,
+    jobs: int,
+    home: Path | None = None,
 ) -> Iterator[Proof]:
     """Train some runs of each arm again and compare them with what was logged.
 
@@ -158,6 +166,7 @@ def prove(
         verify: how many of each arm are trained, by seed; all where there are fewer.
         until: step after which no point is compared; None for whole runs.
         jobs: trainings at a time.
+        home: see `pipelines.tracking.initial.begun`.
 
     Raises:
         InputError: no point of a curve but the one before training lies within `until`.
@@ -166,7 +175,7 @@ def prove(
     tried = {arm: sorted(some, key=lambda one: one.item.card.seed)[:verify] for arm, some in runs.items()}
     queue = [one for some in tried.values() for one in some]
     points = [_points(one.item, until) for one in queue]
-    trained = side_by_side(_train, zip([one.item for one in queue], points, strict=True), jobs)
+    trained = side_by_side(partial(_train, home), zip([one.item for one in queue], points, strict=True), jobs)
     for arm, some in tried.items():
         before = [values_of(tracker.rows([one.run.ref])) for one in some]
         now = [next(trained) for _ in some]
@@ -183,11 +192,10 @@ def _points(item: Item, until: int | None) -> int:
     return points[-1]
 
 
-def _train(job: tuple[Item, int]) -> Values:
+def _train(home: Path | None, job: tuple[Item, int]) -> Values:
     """The values of the present code for a run, to the given point of its curve."""
     item, points = job
-    spec = item.spec
-    trainer = Trainer(spec.env, spec.algo, spec.trainer, spec.seed)
+    trainer = begun(item.spec, home)
     found: Values = {}
     for _, point in zip(range(points + 1), trainer, strict=False):
         found |= values_of_point(point)

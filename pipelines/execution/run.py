@@ -19,10 +19,11 @@ from pipelines.execution.recorder import Recorder
 from pipelines.execution.standing import Standing, by_arm, counted, show
 from pipelines.specs.document import choices
 from pipelines.specs.limits import absent
-from pipelines.specs.source_file import another, remember
 from pipelines.specs.study import Study
+from pipelines.tracking.initial import keep as keep_policies
 from pipelines.tracking.kept_plan import KeptPlan, Options, Place, keep
 from pipelines.tracking.plan import Item, finished, given_twice, items, read_commit, study_card
+from pipelines.tracking.source_file import another, remember
 from pipelines.tracking.staleness import stale_lines, stale_runs
 from pipelines.tracking.tracker import Tracker
 from pipelines.workspace.addresses import without_password
@@ -202,6 +203,8 @@ def _launch(studies: Sequence[Study], home: Home, interrupts: Interrupts, arms: 
         if skipped := sum(one.skipped for one in recorders.each):
             display.say(f"{skipped} of {sum(len(one.wanted) for one in recorders.each)} runs were finished before")
         left = recorders.reuse()
+        for study in studies if left else ():
+            keep_policies(study.policies, home.root)
         while left and not interrupts.came:
             train(studies, recorders, home, interrupts)
             left = recorders.again()
@@ -226,7 +229,8 @@ def _logged(study: Study, code: Code, home: Home, display: Board, arms: Sequence
             display.say(f"{study.name}: {remark}")
         plan = items(study, *code)
         recorder = Recorder(card, plan, tracker, home, display, arms)
-        if study.file and not any(item.spec.imports for item in plan):  # whose code a kept plan does not know
+        # A kept plan knows neither the code of other packages nor the policies that runs start from.
+        if study.file and not any(item.spec.imports or item.spec.trainer.init for item in plan):
             options = Options(study.file, study.profile, study.variant, study.overrides)
             runs = {item.name: Place(item.card.arm, item.key) for item in plan}
             keep(home, options, KeptPlan(study.name, runs, list(study.remarks)))
@@ -266,6 +270,7 @@ def train(studies: Sequence[Study], recorders: Recorders, home: Home, interrupts
             "stop": str(stop),
             "animate": item.key in drawn,
             "imports": named(),
+            "home": str(home.root),
         }
         for item in recorders.todo()
     ]

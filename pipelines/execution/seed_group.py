@@ -48,6 +48,11 @@ class Seeds:
         finals = {f"seeds/{seed}": point["final/return"] for seed, point in points.items() if "final/return" in point}
         return means | finals
 
+    def start_from(self, policy: State) -> None:
+        """Let every seed start from a policy."""
+        for trainer in self.trainers.values():
+            trainer.start_from(policy)
+
     def state_dict(self) -> State:
         """All seeds between two points of the grid."""
         return {"seeds": [trainer.state_dict() for trainer in self.trainers.values()]}

@@ -18,6 +18,7 @@ from pipelines.execution.cluster import check_code, check_plugins, here
 from pipelines.execution.finite import DivergedError, check, defined
 from pipelines.execution.seed_group import Seeds
 from pipelines.specs.study import RunSpec
+from pipelines.tracking.initial import kept
 from pipelines.tracking.policy import FILE, SPEC, Saved, acting
 from pipelines.workspace.best_effort import EPISODE, WHY_NOT
 from pipelines.workspace.own_packages import take
@@ -39,6 +40,7 @@ class Job(TypedDict):
     checkpoint_every: int  # points of the grid
     stop: str  # a file: once it exists, the run saves itself at the next point and ends
     animate: NotRequired[bool]  # leave an animation of an episode beside the policy
+    home: NotRequired[str]  # the work folder, which has a copy of the policy that the run starts from, if any
     imports: NotRequired[dict[str, str]]  # modules that the study's user has named, each with its package's folder
 
 
@@ -90,6 +92,8 @@ class RunTrainable(Trainable):
             if state.get(SPEC, self.job["spec"]) != self.job["spec"]:
                 raise StoreError(f"{self.checkpoints.folder}: the checkpoints are of another run; move the folder away")
             self.load_state(state)
+        elif policy := json.loads(self.job["spec"])["trainer"].get("init"):
+            self.trainer.start_from(kept(policy, Path(self.job["home"])).algorithm)
 
     def make_trainer(self) -> Trainer | Seeds:
         """The trainings of the job, untrained."""

@@ -16,12 +16,12 @@ import pyarrow as pa
 from pipelines.export.tables import write_parquet, write_tables
 from pipelines.specs.plugins import UnnamedError
 from pipelines.specs.study import RunSpec, Study
+from pipelines.tracking.initial import begun
 from pipelines.tracking.plan import items, study_card
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.process_pool import side_by_side
 from pipelines.workspace.work_folder import Home, one_line
 from reports.data.schema import METRICS, PLACE, VERSION
-from rhmc.training.trainer import Trainer
 
 RESULTS = Path("results")
 NAME = "results"  # of the tables of a profile in small form
@@ -134,5 +134,5 @@ def _spec(row: Mapping[Any, Any]) -> RunSpec:
 
 
 def _train(spec: RunSpec) -> list[tuple[int, str, float]]:
-    trainer = Trainer(spec.env, spec.algo, spec.trainer, spec.seed)
+    trainer = begun(spec)
     return [(int(p["step"]), name, value) for p in trainer for name, value in p.items() if name != "step"]

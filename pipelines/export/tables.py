@@ -14,9 +14,9 @@ import pyarrow.parquet as pq
 
 from pipelines.specs.plugins import pages
 from pipelines.specs.readings import Plan
-from pipelines.specs.source_file import another
 from pipelines.specs.study import Study
 from pipelines.tracking.plan import Item, items, study_card
+from pipelines.tracking.source_file import another
 from pipelines.tracking.tracker import Recorded, Row, Tracker
 from pipelines.workspace.errors import InputError, visible
 from pipelines.workspace.exit_codes import Exit

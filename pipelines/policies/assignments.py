@@ -13,12 +13,13 @@ from torch import Tensor
 
 from pipelines.export.tables import read_parquet, write_parquet
 from pipelines.specs.study import Study
+from pipelines.tracking.initial import begun, keep
 from pipelines.tracking.plan import Item, chosen, items
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.process_pool import side_by_side
+from pipelines.workspace.work_folder import work_folder
 from reports.data.schema import METRICS
 from rhmc.hierarchy.regulation import Charges, exact, paper
-from rhmc.training.trainer import Trainer
 from rhmc.types import Metrics, Transition
 
 SUFFIX = ".assignments.parquet"
@@ -108,13 +109,13 @@ def watched(study: Study, arms: Sequence[str] = (), seeds: Sequence[int] = (), j
     found = [item for item in chosen(study, arms, seeds) if item.spec.algo.kind in ASSIGNING]
     if not found:
         raise InputError(f"{study.name} ({study.profile}): no such run assigns targets; {' and '.join(ASSIGNING)} do")
+    keep(study.policies, work_folder())
     for item, points in zip(found, side_by_side(_train, found, jobs), strict=True):
         yield Watched(item, points)
 
 
 def _train(item: Item) -> list[tuple[int, Metrics]]:
-    spec = item.spec
-    trainer = Trainer(spec.env, spec.algo, spec.trainer, spec.seed)
+    trainer = begun(item.spec)
     watch = Watch(trainer.algorithm.observe)
     trainer.algorithm.observe = watch  # type: ignore[method-assign]
     points = ((int(metrics["step"]), watch.take()) for metrics in trainer)

@@ -11,11 +11,11 @@ from pipelines.specs.document import Node, Place, validate
 from pipelines.specs.study import Study
 from pipelines.tracking.plan import Item, chosen, study_card
 from pipelines.tracking.policy import CONFIG, FILE, Actor, NoPolicyError, Saved, load, settings
+from pipelines.tracking.policy_address import is_stored, saved_at
 from pipelines.tracking.tracker import Recorded, Tracker
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.leftovers import scratch
 from pipelines.workspace.work_folder import Home
-from rhmc.algorithms.base import Algorithm
 from rhmc.envs import ENVS, EnvConfig
 from rhmc.training.evaluation import evaluate
 from rhmc.types import Metrics
@@ -47,6 +47,9 @@ class Score(NamedTuple):
     source: str
     episodes: int
     values: Metrics
+    eval_seed: int
+    task: dict[str, Any]  # every setting of the task that was played
+    changed: dict[str, Any]  # what was not as in the run's own final evaluation
 
 
 def score(policy: Policy, wanted: EvaluationEpisodes) -> Score:
@@ -62,9 +65,13 @@ def score(policy: Policy, wanted: EvaluationEpisodes) -> Score:
     episodes = wanted.episodes or trainer.final_episodes
     seed = trainer.eval_seed + FINAL if wanted.seed is None else wanted.seed
     device = trainer.device if torch.cuda.is_available() else "cpu"  # a policy from elsewhere acts here as well
-    played = evaluate(_acting(policy, env, device), env, episodes, seed, device)
+    played = evaluate(acting(policy, env, device).algorithm, env, episodes, seed, device)
     values = {name.removeprefix("final/"): value for name, value in played.means("final").items()}
-    return Score(policy.arm, spec.seed, reached, episodes, values)
+    own, played_in = (one.model_dump(mode="json") for one in (spec.env, env))
+    changed = {name: value for name, value in played_in.items() if value != own[name]}
+    changed |= {"episodes": episodes} if episodes != trainer.final_episodes else {}
+    changed |= {"eval_seed": seed} if seed != trainer.eval_seed + FINAL else {}
+    return Score(policy.arm, spec.seed, reached, episodes, values, seed, played_in, changed)
 
 
 def task(env: EnvConfig, episodes: EvaluationEpisodes) -> EnvConfig:
@@ -91,10 +98,15 @@ def _option(value: Any, name: str) -> Node:
     return Node(value, Place(f"--{name}"), Place(f"--{name}"), "")
 
 
-def _acting(policy: Policy, env: EnvConfig, device: str) -> Algorithm:
+def acting(policy: Policy, env: EnvConfig, device: str = "cpu") -> Actor:
+    """The policy as it acts in a task.
+
+    Raises:
+        InputError: it cannot act there.
+    """
     spec = policy.saved.spec
     try:
-        return Actor(policy.saved, env, device).algorithm
+        return Actor(policy.saved, env, device)
     except ValueError as error:
         if env != spec.env:
             sizes = f"--agents or --targets: {spec.algo.kind} with encoder '{spec.algo.encoder}'"
@@ -104,6 +116,20 @@ def _acting(policy: Policy, env: EnvConfig, device: str) -> Algorithm:
 
 
 # Where policies come from
+
+
+def of_address(address: str, config: Path | None, home: Path) -> Policy:
+    """The policy in a file or a folder, of a run in the log, or in MLflow's registry.
+
+    Raises:
+        InputError: there is none, or `config`, which says of which run a file is, is given with another address.
+    """
+    if not is_stored(address):
+        return of_file(Path(address), config)
+    if config is not None:
+        raise InputError(f"--config: belongs to a file, and {address} says itself which run it is of")
+    saved = saved_at(address, Home(home))
+    return Policy(saved.spec.algo.kind, saved)
 
 
 def of_study(study: Study, home: Path, arms: Sequence[str] = (), seeds: Sequence[int] = ()) -> Iterator[Policy]:
@@ -155,7 +181,7 @@ def _begun(home: Home, item: Item) -> Saved | None:
 
 
 def of_file(file: Path, config: Path | None) -> Policy:
-    """The policy in a file: a kept `policy.pt` or a checkpoint.
+    """The policy in a file, a kept `policy.pt` or a checkpoint, or in a folder that has one.
 
     Args:
         file: says itself which run it is of, or the `config.yaml` beside it does.
@@ -169,7 +195,7 @@ def of_file(file: Path, config: Path | None) -> Policy:
         return Policy(arm, load(file, spec))
     saved = load(file)
     with suppress(InputError):
-        spec, arm = settings(file.with_name(CONFIG))
+        spec, arm = settings(file / CONFIG if file.is_dir() else file.with_name(CONFIG))
         if spec == saved.spec:
             return Policy(arm, saved)
     return Policy(saved.spec.algo.kind, saved)

@@ -1,7 +1,6 @@
 """One episode of a policy as a small animation, beside policies without learning and a bound if wanted."""
 
 import json
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,19 +9,20 @@ import torch
 from torch import Generator, Tensor
 
 from pipelines.policies.animation import Panel, Scene, gif
+from pipelines.policies.evaluation import EvaluationEpisodes, Policy, acting, task
 from pipelines.specs.document import choices
 from pipelines.tracking import policy
+from pipelines.tracking.policy_address import saved_at
 from pipelines.workspace.errors import InputError
-from pipelines.workspace.leftovers import scratch
-from pipelines.workspace.work_folder import Home, StoreError, whole
+from pipelines.workspace.work_folder import Home, whole
 from rhmc.envs import ENVS, EnvConfig, coverage
 from rhmc.yardsticks import POLICIES, offered
 from rhmc.yardsticks.coverage import windows
 from rhmc.yardsticks.joint import best_choice
 
 FRAMES, MILLISECONDS = 40, 110
-RUN = re.compile(r"[0-9a-f]{32}")  # how MLflow names a run
 
+OWN = EvaluationEpisodes()  # those of the run itself
 FREE = "free_heading_bound"  # a bound that can be shown: sensors that take any heading at once
 Act = Callable[[Any], tuple[Tensor, Tensor | None]]  # state -> action (1, N[, A]) and assignment (1, N, M) if any
 
@@ -113,7 +113,12 @@ def _words(name: str, value: float) -> str:
 
 
 def episode_gif(
-    saved: policy.Saved, episode: int = 0, beside: str | None = None, frames: int = FRAMES, note: str = ""
+    saved: policy.Saved,
+    episode: int = 0,
+    beside: str | None = None,
+    frames: int = FRAMES,
+    wanted: EvaluationEpisodes = OWN,
+    note: str = "",
 ) -> bytes:
     """An episode of a trained policy as a GIF.
 
@@ -122,18 +127,16 @@ def episode_gif(
         episode: names the start and the target motion.
         beside: also policies without learning, or `FREE`, in the same episode: names with commas between.
         frames: at most so many.
+        wanted: other numbers of agents and targets; how many episodes it says does not matter here.
         note: kept in the file.
 
     Raises:
-        InputError: no such policy, or a state that this code cannot load.
+        InputError: no such policy or task, or a state that this code cannot load.
     """
-    env = saved.spec.env
+    env = task(saved.spec.env, wanted)
     names = [name.strip() for name in beside.split(",")] if beside else []
     others = [Panel(f"{name.replace('_', ' ')}, episode {episode}", panel(env, name, episode)) for name in names]
-    try:
-        actor = policy.Actor(saved)
-    except ValueError as error:
-        raise InputError(f"the policy cannot be used: {error}") from error
+    actor = acting(Policy(saved.spec.algo.kind, saved), env)
     own = f"{saved.spec.algo.kind}, seed {saved.spec.seed}, episode {episode}"
     return gif(env, [Panel(own, play(env, trained(actor), episode)), *others], frames, MILLISECONDS, note)
 
@@ -145,8 +148,9 @@ def render(
     episode: int = 0,
     beside: str | None = None,
     frames: int = FRAMES,
+    wanted: EvaluationEpisodes = OWN,
 ) -> Path:
-    """Write the animation of a policy, of a run, by its id in MLflow, or of a checkpoint, by its path.
+    """Write the animation of a policy, or of one by its address (`pipelines.tracking.policy_address`).
 
     Raises:
         InputError: what is given cannot be used; nothing is written.
@@ -154,32 +158,11 @@ def render(
     """
     if out.is_dir() or not out.parent.is_dir():
         raise InputError(f"--out: {out} is a folder" if out.is_dir() else f"--out: {out.parent} is no folder")
-    saved = what if isinstance(what, policy.Saved) else _saved(what, home)
+    saved = what if isinstance(what, policy.Saved) else saved_at(what, home)
     torch.set_num_threads(saved.spec.trainer.threads)  # the actions of larger layers depend on it
     note = json.dumps({"run": saved.spec.id, "episode": episode})  # the report's page says whose episode it shows
-    write(out, episode_gif(saved, episode, beside, frames, note))
+    write(out, episode_gif(saved, episode, beside, frames, wanted, note))
     return out
-
-
-def _saved(what: str, home: Home) -> policy.Saved:
-    path = Path(what)
-    if path.exists() or not RUN.fullmatch(what):
-        return policy.load(path)
-    with scratch() as folder:
-        return policy.load(_fetch(what, home, Path(folder)))
-
-
-def _fetch(ref: str, home: Home, folder: Path) -> Path:
-    """The files of a run in the log, in a folder."""
-    from pipelines.tracking.mlflow_tracker import fetch  # 3 s
-
-    try:
-        found = fetch(ref, [policy.FILE, policy.CONFIG], home, folder)
-    except StoreError as error:
-        raise InputError(str(error)) from error
-    if policy.FILE not in found:
-        raise InputError(f"run {ref} keeps no {policy.FILE}: it is not finished, or the file is gone")
-    return folder
 
 
 def write(path: Path, content: bytes) -> None:

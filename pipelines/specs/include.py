@@ -7,18 +7,27 @@
 The path is relative to the file that includes, else to the study, else to `studies/` where the command is called, else
 to the studies of this package. It may leave out `.yaml`. An included file may include others. What stands beside
 `include` goes before what is included. Every value keeps the place where it was written: a fault points into its file.
+
+`preset: tuned` at the top of a study does this for every run by itself: under all that is stated for it lies what
+`settings/<task>` and `settings/<task>/<method>` have. Under `preset: paper` lie the paper's networks and observation.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from pipelines.specs.document import Fault, Node, choices, merge, nearest, read, show
+from pipelines.specs.document import STUDIES, Fault, Node, Place, choices, join, merge, nearest, plain, read, show
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.files import ABSENT, fault_of
 
 KEY, SUFFIX = "include", ".yaml"
-PROJECT = Path("studies")
+PRESET, TUNED = "preset", "tuned"
+# What a preset states for all tasks and methods; the paper's other settings are the defaults.
+PRESETS: dict[str, dict[str, dict[str, str]]] = {
+    TUNED: {},
+    "paper": {"env": {"observation": "paper"}, "algo": {"encoder": "mlp"}},
+}
+PROJECT = Path(STUDIES)
 DEPTHS = ("*/*.yaml", "*/*/*.yaml")  # where files to be included lie, from a folder of studies
 SHIPPED = Path(__file__).parents[1] / "studies"  # a link to `studies/`, and a folder in a wheel
 
@@ -42,16 +51,38 @@ def included(root: Node, folder: Path, sections: Sequence[str]) -> tuple[Node, l
 
 
 def closure(study: Path) -> list[Path]:
-    """The file of a study, then all that it includes, directly or not. What cannot be read is left out."""
+    """The file of a study, then all that it or its preset includes, directly or not; without what cannot be read."""
     found: dict[Path, Path] = {}  # by what it is, as one file may be named in several ways
+    roots: list[Node | None] = []
     waiting = [study]
     while waiting:
         file = waiting.pop(0)
         if not fault_of(file) and found.setdefault(file.resolve(), file) is file:
-            root, _ = read(file)
+            roots.append(read(file)[0])
             way = _Way(study.parent, (file,))
-            waiting += [way.file(link.value) for link in _links(root) if isinstance(link.value, str)]
+            waiting += [way.file(link.value) for link in _links(roots[-1]) if isinstance(link.value, str)]
+        if not waiting:
+            preset = [_Way(study.parent).file(name) for name in _of_preset(roots)]
+            waiting = [path for path in preset if not fault_of(path) and path.resolve() not in found]
     return list(found.values())
+
+
+def _of_preset(roots: Sequence[Node | None]) -> list[str]:
+    """The names of what a tuned study takes, by the kinds in it and in what it includes."""
+    if not roots or roots[0] is None or plain(roots[0].children.get(PRESET)) != TUNED:
+        return []
+    tasks, methods = ([kind for root in roots for kind in _kinds(root, section)] for section in ("env", "algo"))
+    return [_tuned(task) for task in tasks] + [_tuned(task, method) for task in tasks for method in methods]
+
+
+def _kinds(node: Node | None, section: str) -> Iterator[str]:
+    for key, child in (node.children if node else {}).items():
+        kind = child.children.get("kind") if key == section else None
+        yield from [kind.value] if kind and isinstance(kind.value, str) else _kinds(child, section)
+
+
+def _tuned(task: str, method: str = "") -> str:
+    return f"settings/{task}/{method}" if method else f"settings/{task}"
 
 
 class _Way(NamedTuple):
@@ -152,6 +183,74 @@ def _offered(way: _Way, name: str) -> list[str]:
 
 def _empty(link: Node, path: Path, section: str) -> Fault:
     return Fault(link.place, link.path, f"{path}: empty; a file to be included has a mapping '{section}'")
+
+
+# Presets: the lowest layer of every run
+
+
+class Preset:
+    """The settings that lie under all that a study states, by task and method.
+
+    Attributes:
+        without: methods and tasks for which there are no tuned settings, in the words of a remark.
+    """
+
+    def __init__(self, node: Node | None, folder: Path) -> None:
+        self.node = node if node is not None and node.value in PRESETS else None  # else its fault is said elsewhere
+        self.way = _Way(folder)
+        self.without: dict[Fault, None] = {}
+        self._read: dict[tuple[str, str], tuple[Node | None, list[Fault]]] = {}  # by name and section
+
+    def under(
+        self, stated: Node, section: str, task: str, method: str, fields: Collection[str]
+    ) -> tuple[Node, list[Fault]]:
+        """A section over what the preset has for it.
+
+        Args:
+            stated: the section as the layers of the study have it.
+            section: env, algo or trainer.
+            task: the kind of the task.
+            method: the kind of the method.
+            fields: of the section's configuration; a package's own method may have no encoder.
+        """
+        if self.node is None:
+            return stated, []
+        values = PRESETS[str(self.node.value)].get(section, {})
+        layer: Node | None = _written({key: value for key, value in values.items() if key in fields}, self.node)
+        faults: list[Fault] = []
+        if self.node.value == TUNED:
+            name = _tuned(task, method if section == "algo" else "")
+            if (name, section) not in self._read:
+                self._read[name, section] = self._file(self.node, name, section)
+            layer, faults = self._read[name, section]
+        if layer is None and section == "algo" and not faults:
+            text = f"no tuned settings for {show(method)} in {show(task)}: what is not stated has its default"
+            self.without[Fault(self.node.place, self.node.path, text)] = None
+        return (stated._replace(value=merge(layer, stated).value) if layer else stated), faults
+
+    def _file(self, node: Node, name: str, section: str) -> tuple[Node | None, list[Fault]]:
+        link, path = node._replace(value=name), self.way.file(name)
+        if fault_of(path) == ABSENT:
+            return None, []
+        root, _ = read(path)
+        if root is not None and root.children and section not in root.children:
+            return None, []  # a task without settings of the trainer
+        return _source(link, section, self.way)
+
+
+def _written(values: dict[str, str], at: Node) -> Node:
+    children = {key: Node(value, at.place, at.key, join(at.path, key)) for key, value in values.items()}
+    return at._replace(value=children)
+
+
+def tuned(section: str, task: str, method: str = "") -> dict[str, Any]:
+    """The tuned settings of a method in a task, or of the task itself, as a study here would get them."""
+    place = Place("")
+    stated, _ = Preset(Node(TUNED, place, place, ""), PROJECT).under(
+        Node({}, place, place, ""), section, task, method, ()
+    )
+    values: dict[str, Any] = plain(stated)
+    return values
 
 
 # Studies that this package brings along

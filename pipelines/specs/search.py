@@ -31,6 +31,7 @@ from pipelines.specs.document import Fault, Node, Place, choices, join, merge, s
 from pipelines.specs.grid import nested
 from pipelines.specs.identity import code_id
 from pipelines.specs.include import closure
+from pipelines.specs.initial import Find, addresses, nowhere
 from pipelines.specs.plugins import configs
 from pipelines.specs.safe_names import study_name
 from pipelines.specs.study import (
@@ -133,6 +134,7 @@ class File(Frozen):
     """A search's file."""
 
     question: str = Field(min_length=1)
+    preset: Literal["tuned", "paper"] | None = None
     base: Base
     arms: dict[str, SearchArm] = Field(min_length=1)
     trials: Counts
@@ -194,12 +196,15 @@ class Search(Frozen):
     sha256: str  # of the file, and of what it includes
     overrides: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()  # as a study's
+    policies: dict[str, str] = Field(default_factory=dict)  # as a study's
 
     @classmethod
-    def load(cls, path: Path | str, profile: str = "quick", overrides: Sequence[str] = ()) -> Self:
+    def load(
+        cls, path: Path | str, profile: str = "quick", overrides: Sequence[str] = (), find: Find = nowhere
+    ) -> Self:
         """Read, merge and check a search. Arguments and errors as in `Study.load`."""
         path = Path(path)
-        loaded = load_layers(path, File, profile, overrides, COUNTS)
+        loaded = load_layers(path, File, profile, overrides, COUNTS, find=find)
         faults = [fault for fault in loaded.faults if TWIN not in fault.text]
         if loaded.file is None or faults:
             raise StudyError(_no_search(loaded.root) or faults)
@@ -213,7 +218,8 @@ class Search(Frozen):
         counts = {name: getattr(getattr(file, name), profile) for name in COUNTS}
         parts = {name: getattr(file, name) for name in ("sampler", "pruner", "resources")}
         names = {"name": study_name(path), "profile": profile, "file": str(path)}
-        told = {"overrides": tuple(overrides), "remarks": tuple(map(str, dict.fromkeys(loaded.wanted.remarks)))}
+        remarks = tuple(map(str, dict.fromkeys(loaded.wanted.remarks)))
+        told = {"overrides": tuple(overrides), "remarks": remarks, "policies": addresses(loaded.policies)}
         digest = hashlib.sha256(b"".join(file.read_bytes() for file in closure(path))).hexdigest()
         return cls(question=file.question.strip(), arms=arms, sha256=digest, **names, **told, **counts, **parts)
 

@@ -2,11 +2,11 @@
 
 A file has `question`, `base` (env, algo, trainer), `arms` (each changes the base), `seeds` and `steps` (a number, or
 one for each profile), and may have `grid` (lists of values for dotted keys: every arm, or the base without arms, is
-taken to every combination) or `readings` (every arm is taken to each, see `pipelines.specs.readings`), `variants` (each
-changes every arm, whatever its kind), `profiles` (what else a profile changes in the base, and in single arms as
-`changes`; the arms, the values of the grid and the design of the readings that it is content with) and `resources`. The
-layers of a run are base, profile, reading, arm, the profile's change of the arm, point of the grid, variant. All that
-is wrong with a file is found before anything starts.
+taken to every combination) or `readings` (every arm is taken to each, see `pipelines.specs.readings`), `variants`
+(each changes every arm, whatever its kind), `preset` (settings under all that is stated), `profiles` (what else a
+profile changes in the base, and in single arms as `changes`; the arms, the values of the grid and the design of the
+readings that it is content with) and `resources`. The layers of a run are preset, base, profile, reading, arm, the
+profile's change of the arm, point of the grid, variant. All that is wrong with a file is found before anything starts.
 """
 
 import hashlib
@@ -29,13 +29,15 @@ from pipelines.specs.document import (
     join,
     merge,
     override,
+    plain,
     read,
     settings,
     show,
     validate,
 )
 from pipelines.specs.grid import MOST, Point, nested, points, replaced
-from pipelines.specs.include import included
+from pipelines.specs.include import PRESET, Preset, included
+from pipelines.specs.initial import FIELD, Find, Policy, Starts, addresses, nowhere
 from pipelines.specs.plugins import configs
 from pipelines.specs.readings import NOTHING, Cell, Plan, ProfileReadings, Reading, Readings, Spelled, spelled
 from pipelines.specs.safe_names import ARM, PROFILES, alike, fault_of_study, simple, study_name, too_long
@@ -172,11 +174,19 @@ class Study(Frozen):
     variant: str = ""
     readings: Plan | None = None
     cells: dict[str, Cell] = Field(default_factory=dict)  # by arm, where the study has readings
-    remarks: tuple[str, ...] = ()  # what is allowed and gives nothing: arms whose budget ends before they learn
+    remarks: tuple[
+        str, ...
+    ] = ()  # arms whose budget ends before they learn; what the policies are that runs start from
+    policies: dict[str, str] = Field(default_factory=dict)  # by digest, where those were found that runs start from
 
     @classmethod
     def load(
-        cls, path: Path | str, profile: str = "quick", overrides: Sequence[str] = (), variant: str | None = None
+        cls,
+        path: Path | str,
+        profile: str = "quick",
+        overrides: Sequence[str] = (),
+        variant: str | None = None,
+        find: Find = nowhere,
     ) -> Self:
         """Read, merge and check a study.
 
@@ -188,11 +198,12 @@ class Study(Frozen):
                 on, and `trainer.steps` for `steps`. They go before a profile's changes of the base;
                 an arm keeps what it states, or the profile for it.
             variant: one of the file's `variants`; None for the arms as they stand.
+            find: looks for the policies that `trainer.init` names.
 
         Raises:
             StudyError: with every fault found.
         """
-        loaded = load_layers(Path(path), File, profile, overrides, COUNTS, gridded=GridFile, variant=variant)
+        loaded = load_layers(Path(path), File, profile, overrides, COUNTS, gridded=GridFile, variant=variant, find=find)
         file, wanted = loaded.file, loaded.wanted
         if loaded.faults or file is None or wanted.base is None:
             raise StudyError(_no_study(loaded.root) or loaded.faults)
@@ -202,6 +213,7 @@ class Study(Frozen):
         name = study_name(Path(path), variant or "")
         fixed |= {"readings": wanted.readings, "cells": wanted.cells}
         fixed["remarks"] = tuple(map(str, dict.fromkeys(wanted.remarks)))
+        fixed["policies"] = addresses(loaded.policies)
         return cls(name=name, base=wanted.base, arms=wanted.arms, **fixed, **resolved)
 
     def runs(self) -> list[PlannedRun]:
@@ -278,9 +290,10 @@ class Profiles(Frozen):
 
 
 class File(Frozen):
-    """A study's file."""
+    """A study's file. `preset`: what lies under all that it states, see `pipelines.specs.include`."""
 
     question: str = Field(min_length=1)
+    preset: Literal["tuned", "paper"] | None = None
     base: Base
     arms: dict[str, Layer] = Field(min_length=1)
     grid: Grid = Field(default_factory=dict)
@@ -322,6 +335,13 @@ class Planned(NamedTuple):
     reading: Reading | None = None
 
 
+class Beside(NamedTuple):
+    """What a study takes from elsewhere."""
+
+    preset: Preset
+    starts: Starts
+
+
 class Loaded(NamedTuple, Generic[M]):
     """A file whose layers are merged, and every fault so far; `file` is None where its shape is wrong."""
 
@@ -329,6 +349,7 @@ class Loaded(NamedTuple, Generic[M]):
     root: Node
     wanted: Resolved
     faults: list[Fault]
+    policies: Mapping[str, Policy]
 
 
 def load_layers(
@@ -340,6 +361,7 @@ def load_layers(
     *,
     gridded: type[M] | None = None,
     variant: str | None = None,
+    find: Find = nowhere,
 ) -> Loaded[M]:
     """Read, merge and check what all files with arms have in common.
 
@@ -351,6 +373,7 @@ def load_layers(
         counts: names of the fields that hold a number for each profile.
         gridded: its shape where it has a grid.
         variant: one of its `variants`; None for the arms as they stand.
+        find: see `Study.load`.
 
     Raises:
         StudyError: there is no mapping to go on with, or a module that it imports cannot be used.
@@ -361,16 +384,23 @@ def load_layers(
     if found := plugins.imported(root.children.get(IMPORTS), path.parent):
         raise StudyError([*faults, *found])
     plugins.discover()
+    starts = Starts(path.parent, find)  # after what is imported, of which a policy may be
+    beside = Beside(Preset(root.children.get(PRESET), path.parent), starts)
+    whole = [starts.named(tree) for tree in (root, *patches)]
+    root, patches = whole[0][0], [tree for tree, _ in whole[1:]]
+    unnamed = list(dict.fromkeys(fault for _, found in whole for fault in found))
     file, structure = validate(gridded if gridded and "grid" in root.children else model, root)
     known = root._replace(value={key: child for key, child in root.children.items() if key in model.model_fields})
     variants = _group(known, "variants")
-    resolved = {(p, v): _settings(known, p, v, patches) for p in PROFILES for v in (None, *variants)}
-    faults += structure + _variant_faults(path, variants, variant)
+    resolved = {(p, v): _settings(known, p, v, patches, beside) for p in PROFILES for v in (None, *variants)}
+    faults += structure + unnamed + _variant_faults(path, variants, variant)
     # An arm that is wrong in its shape resolves to the base: that it is the same as another is no news then.
-    faults += [f for one in resolved.values() for f in one.faults if not (structure and TWIN in f.text)]
+    faults += [f for one in resolved.values() for f in one.faults if not ((structure or unnamed) and TWIN in f.text)]
     if file is not None and profile in PROFILES:
         faults += [f for name in counts for f in _no_value(root, name, profile)]
-    return Loaded(file, root, resolved.get((profile, variant)) or resolved[PROFILES[0], None], faults)
+    wanted = resolved.get((profile, variant)) or resolved[PROFILES[0], None]
+    remarks = [*wanted.remarks, *beside.preset.without, *starts.remarks]
+    return Loaded(file, root, wanted._replace(remarks=remarks), faults, starts.found)
 
 
 def _trees(
@@ -478,7 +508,7 @@ def _with_design(node: Node) -> Node:
     return node._replace(value=node.children | {"readings": block})
 
 
-def _settings(root: Node, profile: str, variant: str | None, patches: Sequence[Node]) -> Resolved:
+def _settings(root: Node, profile: str, variant: str | None, patches: Sequence[Node], beside: Beside) -> Resolved:
     """Resolve the base and every arm for a profile. Overrides of the base go before what the profile changes in it."""
     chosen = _child(_child(root, "profiles"), profile)
     layers = [root.children.get("base"), chosen, *(_child(patch, "base") for patch in patches)]
@@ -486,7 +516,7 @@ def _settings(root: Node, profile: str, variant: str | None, patches: Sequence[N
     common = [reduce(merge, stated)] if stated else []
     last = [layer for layer in [_child(_child(root, "variants"), variant or "")] if layer]
     steps = _child(_child(root, "steps"), profile)
-    base, faults = _setting([*common, *last] if common else [], steps)
+    base, faults = _setting([*common, *last] if common else [], steps, beside)
     planned, plan, found = _planned(root, chosen, patches)
     faults += found + [fault for layer in last for fault in _unstated(common[0] if common else None, layer)]
     arms: dict[str, Setting] = {}
@@ -494,7 +524,7 @@ def _settings(root: Node, profile: str, variant: str | None, patches: Sequence[N
     owners: dict[Fault, list[str]] = {}
     for name, (written, arm, reading) in planned.items():
         faults += _unstated(common[0] if common else None, arm)
-        setting, found = _setting([*common, arm, *last], steps)
+        setting, found = _setting([*common, arm, *last], steps, beside)
         for fault in set(found) - set(faults):
             owners.setdefault(fault, []).append(written)
         if setting is not None:
@@ -591,19 +621,31 @@ def _group(root: Node, key: str) -> dict[str, Node]:
     return group.children if group else {}
 
 
-def _setting(layers: Sequence[Node], steps: Node | None) -> tuple[Setting | None, list[Fault]]:
+def _setting(layers: Sequence[Node], steps: Node | None, beside: Beside) -> tuple[Setting | None, list[Fault]]:
     parts, faults = {}, []
-    for section in SECTIONS:
-        node = _section(layers, section)
+    stated = {section: _section(layers, section) for section in SECTIONS}
+    for section, node in stated.items():
         if node is not None:
+            node, faulty = _over_preset(section, node, stated, beside.preset)
             parts[section], found = _trainer(node, steps) if section == "trainer" else _of_kind(section, node)
-            faults += found
+            faults += [*faulty, *found]
     complete = len(parts) == len(SECTIONS) and all(part is not None for part in parts.values())
     if not complete or faults:
         return None, faults
     setting = Setting(**parts)
-    faults = _misfit(setting, layers)
+    faults = _misfit(setting, layers) or _no_start(setting, layers, beside.starts)
     return (None if faults else setting), faults
+
+
+def _over_preset(
+    section: str, node: Node, stated: Mapping[str, Node | None], preset: Preset
+) -> tuple[Node, list[Fault]]:
+    """A section over what the preset of the study has for its task and its method."""
+    kinds = {name: plain(_child(stated[name], "kind")) for name in ("env", "algo")}
+    if any(not isinstance(kind, str) or kind not in configs(name) for name, kind in kinds.items()):
+        return node, []  # which is said of the kind
+    fields = configs(section)[kinds[section]].model_fields if section in kinds else trainer.Config.model_fields
+    return preset.under(node, section, kinds["env"], kinds["algo"], fields)
 
 
 def _misfit(setting: Setting, layers: Sequence[Node]) -> list[Fault]:
@@ -615,6 +657,13 @@ def _misfit(setting: Setting, layers: Sequence[Node]) -> list[Fault]:
     env = _section(layers, "env")
     node = _child(env, field) or env
     return [Fault(node.place, node.path, fault)] if node else []
+
+
+def _no_start(setting: Setting, layers: Sequence[Node], starts: Starts) -> list[Fault]:
+    """A policy from which the run cannot start, at the place where it is named."""
+    node = _child(_section(layers, "trainer"), FIELD)
+    text = starts.misfit(setting) if node else ""
+    return [Fault(node.place, node.path, text)] if node and text else []
 
 
 def _section(layers: Sequence[Node], name: str) -> Node | None:

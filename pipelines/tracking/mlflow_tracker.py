@@ -538,6 +538,23 @@ def fetch(ref: str, wanted: Sequence[str], home: Home, folder: Path) -> list[str
     return [name for name in wanted if log.file(ref, name, folder)]
 
 
+def versions(name: str, home: Home) -> dict[str, str] | list[str]:
+    """The runs of a registered model by version, oldest first; the names of all models if it is none.
+
+    Raises:
+        StoreError: no store, or it cannot be read.
+    """
+    log = open_existing(StudyCard("", "", ""), home)
+    if log is None:
+        return []
+    with explained(log.uri):
+        known = [str(one.name) for one in log.client.search_registered_models()]
+        if name not in known:
+            return known
+        found = log.client.search_model_versions(f"name = '{name}'")
+        return {str(one.version): str(one.run_id) for one in sorted(found, key=lambda one: int(one.version))}
+
+
 def _copied(kept: ArtifactRepository, name: str, folder: Path) -> Path | None:
     """A copy of a file in a folder, if it is kept."""
     if name not in {one.path for one in kept.list_artifacts()}:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pipelines.export.tables import write_parquet
 from pipelines.specs.search import Search
-from pipelines.specs.source_file import another
+from pipelines.tracking.source_file import another
 from pipelines.tuning.trials import Recorded, explained, look, opened, storage_url
 from pipelines.workspace.errors import visible
 from pipelines.workspace.exit_codes import Exit

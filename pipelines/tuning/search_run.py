@@ -22,8 +22,9 @@ from pipelines.execution.ray_settings import set_up_ray
 from pipelines.execution.run import Interrupts, guarded, missing_devices
 from pipelines.execution.tally import Ended, Tally, Training
 from pipelines.specs.search import Search
-from pipelines.specs.source_file import another, remember
+from pipelines.tracking.initial import keep as keep_policies
 from pipelines.tracking.plan import read_commit
+from pipelines.tracking.source_file import another, remember
 from pipelines.tracking.tracker import Card, RunLog, Status, StudyCard, Tracker
 from pipelines.tuning.best_params import file_name, stem, winner_yaml, write_text
 from pipelines.tuning.trials import OBJECTIVE, ArmStudy, BaseStorage, TrialRequest, explained, look, opened, storage_url
@@ -138,6 +139,7 @@ def _clear(search: Search, arm_study: ArmStudy, home: Home) -> None:
 def _train(
     search: Search, arm_studies: Sequence[ArmStudy], trial_log: "TrialLog", home: Home, interrupts: Interrupts
 ) -> None:
+    keep_policies(search.policies, home.root)
     trial_log.board.say(STARTS)
     set_up_ray()
     from pipelines.execution.ray_driver import ray_session  # 3 s
@@ -232,6 +234,7 @@ class Drive:
                 "checkpoint_every": self.search.resources.checkpoint_every,
                 "stop": str(self.stop.path),
                 "imports": named(),
+                "home": str(self.home.root),
             }
         )
 

@@ -47,7 +47,7 @@ class Config(TargetNetworks, Standardised, OnPolicy):
     kind: Literal["coma"] = "coma"
     lr: float = Field(1e-3, gt=0, description="Adam's step size")
     tau: float = Field(0.02, ge=0, le=1, description="share of the way that the target critic moves per update")
-    gamma: float = Field(0.95, ge=0, le=1)
+    gamma: float = Field(0.95, ge=0, le=1, description="discount per environment step")
     standardise: Literal["none", "reward", "return"] = Field(
         "return",
         description="learn from rewards, or predict returns, of mean 0 and deviation 1 (`rhmc.learning.normalisation`)",

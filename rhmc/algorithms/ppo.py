@@ -44,7 +44,11 @@ class Config(Recurrent, Standardised, OnPolicy):
     gae_lambda: float = Field(0.95, ge=0, le=1, description="lambda of the advantages")
     epochs: int = Field(10, ge=1, description="passes over a rollout")
     minibatches: int = Field(4, ge=1, description="updates of a pass, each on its share of the rows")
-    objective: Literal["clip", "kl_adaptive"] = "clip"
+    objective: Literal["clip", "kl_adaptive"] = Field(
+        "clip",
+        description="what keeps the new policy near the old one: a clipped ratio of probabilities, or a penalty on "
+        "their divergence",
+    )
     clip_range: float = Field(
         0.2, gt=0, description="clip: distance from 1 at which the ratio of probabilities is clipped"
     )

@@ -28,8 +28,8 @@ class Config(Recurrent, TargetNetworks, Standardised, OffPolicy):
     """Settings; lr and gamma are the paper's."""
 
     double_q: bool = Field(True, description="double Q; false: the target network chooses too")
-    epsilon_end: float = Field(0.05, ge=0, le=1)
-    epsilon_steps: int = Field(50_000, ge=1)
+    epsilon_end: float = Field(0.05, ge=0, le=1, description="share of random actions in the end, from 1 at the start")
+    epsilon_steps: int = Field(50_000, ge=1, description="environment steps until that share is reached (linear)")
 
     @model_validator(mode="after")
     def _whole_segments(self) -> Self:

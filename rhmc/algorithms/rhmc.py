@@ -42,7 +42,11 @@ class Config(coordinator.Config, executor.Config, Replayed):
     """Settings; those that the text gives (lr, gammas, Algorithms 1 and 2 as printed) are the defaults."""
 
     kind: Literal["rhmc"] = "rhmc"
-    regulator: Literal["none", "paper", "exact"] = "paper"
+    regulator: Literal["none", "paper", "exact"] = Field(
+        "paper",
+        description="least reward of an assignment: what agents could complete within `horizon` steps, by Algorithm 1 "
+        "or its optimum; or none",
+    )
     horizon: int = Field(1, ge=1, description="steps that the regulator lets an agent act")
     alpha: float = Field(0.1, ge=0, le=1, description="alpha_1 of Eq. 6")
     unassigned: Literal["free", "charged"] = Field(

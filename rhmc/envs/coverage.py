@@ -55,12 +55,20 @@ class Config(EnvConfig):
     """The task; `preset` chooses among the three published variants (`PRESETS`)."""
 
     kind: Literal["coverage"] = "coverage"
-    preset: Literal["flat", "executor", "coordinator"] = "flat"
-    agents: int = Field(4, ge=1)
-    targets: int = Field(5, ge=1)
-    observation: Literal["paper", "extended", "extended_own"] = "paper"
+    preset: Literal["flat", "executor", "coordinator"] = Field(
+        "flat", description="published variant: how targets start and move, length of an episode, who is rewarded"
+    )
+    agents: int = Field(4, ge=1, description="N sensors")
+    targets: int = Field(5, ge=1, description="M targets")
+    observation: Literal["paper", "extended", "extended_own"] = Field(
+        "paper",
+        description="features of a pair: the paper's four, or ten with what other sensors do; extended_own: without "
+        "the last two",
+    )
     penalty: float = Field(0.1, ge=0, description="minus this is the reward when nothing is captured")
-    boxes: tuple[tuple[int, int, int, int], ...] = BOXES
+    boxes: tuple[tuple[int, int, int, int], ...] = Field(
+        BOXES, description="x0, x1, y0, y1 of the box in which each sensor starts, in metres"
+    )
 
     @model_validator(mode="after")
     def _fits(self) -> Self:

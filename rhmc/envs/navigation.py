@@ -33,11 +33,17 @@ class Config(EnvConfig):
 
     kind: Literal["navigation"] = "navigation"
     agents: int = Field(default=3, ge=1, description="N agents, and as many landmarks")
-    reward: Literal["paper", "mpe2", "mpe1"] = "paper"
+    reward: Literal["paper", "mpe2", "mpe1"] = Field(
+        "paper",
+        description="minus distances and collisions: each agent's to its nearest landmark (Eq. 18), or each landmark's "
+        "to its nearest agent, weighted as in either version of the particle environments",
+    )
     order: Order = Field(default="mpe2", description="integration: mpe2 moves first, mpe1 changes velocity first")
     continuous: bool = Field(default=False, description="act by a force in [-1, 1]^2 instead of five directions")
-    observation: Literal["paper", "extended"] = "paper"
-    episode: int = Field(default=25, ge=1)
+    observation: Literal["paper", "extended"] = Field(
+        "paper", description="as in mpe2; extended: also distances, who is nearest to a landmark, relative velocities"
+    )
+    episode: int = Field(default=25, ge=1, description="steps of an episode")
 
 
 class State(NamedTuple):

@@ -42,7 +42,7 @@ class Settings(Frozen):
         "all", description="assignments that the critic is told, or QMIX's mixture: all of them; or none, as in Q(x, a)"
     )
     lr: float | None = Field(None, gt=0, description="Adam's step size at this level instead of the method's")
-    gamma: float = Field(0.99, ge=0, le=1)
+    gamma: float = Field(0.99, ge=0, le=1, description="discount per environment step")
     standardise: Scale = Field("none", description="as `standardise` of other methods")
     epsilon: float = Field(0.05, ge=0, le=1, description="share of actions drawn at random while exploring")
     logit_penalty: float = Field(1e-3, ge=0, description="weight of the squared logits (as in MADDPG)")

@@ -10,7 +10,11 @@ from rhmc.types import Frozen
 class Networks(Frozen):
     """Settings of every method; the defaults are the paper's (section 5.1) where it gives a value."""
 
-    encoder: EncoderName = "mlp"
+    encoder: EncoderName = Field(
+        "mlp",
+        description="fully connected on all features (the paper's), for fixed numbers of agents and targets; or one "
+        "network on every pair of agent and target, for any numbers (`rhmc.networks.nets`)",
+    )
     hidden_dim: int = Field(64, ge=1, description="units of each hidden layer")
     share: bool = Field(True, description="one network for all agents; `mlp` adds a one-hot id of the agent")
     lr: float = Field(5e-4, gt=0, description="Adam's step size")
@@ -26,7 +30,7 @@ class TargetNetworks(Networks):
 class Standardised(Frozen):
     """Settings of methods with one reward and one discount."""
 
-    gamma: float = Field(0.99, ge=0, le=1)
+    gamma: float = Field(0.99, ge=0, le=1, description="discount per environment step")
     standardise: Scale = Field(
         "reward",
         description="learn from rewards, or predict returns, of mean 0 and deviation 1 (`rhmc.learning.normalisation`)",

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import EnvConfig, make_env
+from rhmc.learning.initial import started
 from rhmc.learning.schedules import linear
 from rhmc.training.evaluation import evaluate
 from rhmc.types import Batch, Frozen, Metrics, State, Transition
@@ -16,7 +17,7 @@ from rhmc.types import Batch, Frozen, Metrics, State, Transition
 class Config(Frozen):
     """Budget and evaluation of a run; all steps are environment steps, summed over the parallel copies."""
 
-    steps: int = Field(5_000_000, ge=1)
+    steps: int = Field(5_000_000, ge=1, description="budget: environment steps of the run")
     num_envs: int = Field(128, ge=1, description="parallel copies; part of a run's identity, trajectories depend on it")
     bootstrap_on_truncation: bool = Field(
         True, description="for every method, the time limit is a truncation (bootstrap); false: a termination"
@@ -25,17 +26,25 @@ class Config(Frozen):
         1.0, ge=0, le=1, description="share of every step size that is left at the end of the budget (linear)"
     )
     evaluations: int = Field(100, ge=1, description="points of the curve after the one at step 0")
-    eval_episodes: int = Field(100, ge=1)
-    final_episodes: int = Field(500, ge=1)
+    eval_episodes: int = Field(100, ge=1, description="evaluation episodes of each point of the curve")
+    final_episodes: int = Field(500, ge=1, description="evaluation episodes after the last point")
     eval_seed: int = Field(10_000_000, ge=0, description="names the evaluation episodes")
-    device: str = "cpu"
+    device: str = Field("cpu", description="device of networks and environments: cpu, cuda or cuda:N")
     threads: int = Field(1, ge=1, description="torch threads; results of larger layers depend on it")
+    init: str | None = Field(
+        None,
+        pattern=r"^[0-9a-f]{16}$",
+        exclude_if=lambda digest: digest is None,
+        description="policy whose networks the run starts from: a study gives a file, a folder, runs:/ID or "
+        "models:/NAME/VERSION, a run keeps the digest of what it took over",
+    )
 
 
 class Trainer:
     """Iterator: each `next` trains to the next point of the grid, evaluates and returns metrics.
 
-    The first item is the untrained policy at step 0. The last one holds `final/...` from more episodes.
+    The first item is the untrained policy at step 0, or that of `start_from`, which `cfg.init` asks for. The last one
+    holds `final/...` from more episodes.
 
     Args:
         env: the task.
@@ -62,6 +71,7 @@ class Trainer:
         self.carry = self.algorithm.carry(cfg.num_envs)
         self.step = 0
         self.point = -1  # last finished point of the grid
+        self.waits = cfg.init is not None  # for the policy that it starts from
 
     @property
     def done(self) -> bool:
@@ -74,6 +84,8 @@ class Trainer:
     def __next__(self) -> Metrics:
         if self.done:
             raise StopIteration
+        if self.waits:
+            raise ValueError(f"init: the run starts from policy {self.cfg.init}; give it to start_from first")
         self.point += 1
         metrics = self._train(grid_step(self.cfg, self.point))
         played = evaluate(self.algorithm, self.env_cfg, self.cfg.eval_episodes, self.cfg.eval_seed, self.cfg.device)
@@ -83,6 +95,17 @@ class Trainer:
             played = evaluate(self.algorithm, self.env_cfg, self.cfg.final_episodes, seed, self.cfg.device)
             metrics |= played.means("final")
         return {"step": float(self.step)} | metrics
+
+    def start_from(self, policy: State) -> None:
+        """Take over the networks and statistics in a method's state (`rhmc.learning.initial`), before the first point.
+
+        Raises:
+            ValueError: the run has begun, or they do not fit.
+        """
+        if self.point >= 0:
+            raise ValueError(f"init: the run is at step {self.step:,}; a policy is where it starts from")
+        self.algorithm.load_state_dict(started(self.algorithm.state_dict(), policy))
+        self.waits = False
 
     def _train(self, until: int) -> Metrics:
         means = Means()
@@ -140,6 +163,7 @@ class Trainer:
         self.obs = type(self.obs)(**{k: v.to(device) for k, v in state["obs"].items()})
         self.carry = {k: v.to(device) for k, v in state["carry"].items()}
         self.step, self.point = state["step"], state["point"]
+        self.waits = False
 
 
 class Means:

@@ -84,6 +84,7 @@ gamma >= 0 <= 1: 0.99 (qmix, vdn, iql, maddpg, mappo, ippo)
 hidden_dim >= 1: 64 (rhmc, qmix, vdn, iql, maddpg, coma, mappo, ippo, hitmac)
 horizon >= 1: 1 (rhmc)
 huber > 0: 10.0 (mappo, ippo)
+init ~ ^[0-9a-f]{16}$: None (trainer)
 kl_target > 0: 0.01 (mappo, ippo)
 learning_starts >= 0: 2000 (rhmc, qmix, vdn, iql, maddpg, hitmac)
 lr > 0: 0.0005 (rhmc, qmix, vdn, iql, maddpg, hitmac)
@@ -140,6 +141,8 @@ def bound(one: Any) -> str:
             return f"> {less}"
         case Le(most):
             return f"<= {most}"
+    if pattern := getattr(one, "pattern", ""):
+        return f"~ {pattern}"
     raise AssertionError(one)
 
 

@@ -21,10 +21,10 @@ from ruamel.yaml import YAML
 
 from pipelines.specs.safe_names import PROFILES, RESERVED, STUDY, folded, simple, slug
 from pipelines.specs.search import Search
-from pipelines.specs.source_file import another, remember
 from pipelines.specs.study import Study, StudyError
 from pipelines.tracking.plan import chosen
 from pipelines.tracking.registry import model_name
+from pipelines.tracking.source_file import another, remember
 from pipelines.tracking.tracker import StudyCard
 from pipelines.tuning.best_params import file_name, stem
 from pipelines.workspace.errors import LONGEST, MOST, InputError, visible

@@ -38,7 +38,7 @@ steps: 1000
 """
 PAPER = "--profile paper --set seeds=3"
 OTHER = f"{PAPER} --variant large"
-ONE = Score("full", 1, "finished", 8, {"return": 1.25, "return_sem": 0.5})
+ONE = Score("full", 1, "finished", 8, {"return": 1.25, "return_sem": 0.5}, 9, {"kind": "coverage"}, {})
 
 
 class Case(NamedTuple):
@@ -87,13 +87,29 @@ CASES = [
         ("watched(x@large paper 3, [full], [1], 3)",),
     ),
     Case(
-        "render studies/x.yaml --profile paper --variant large --arm full --seed 1 --episode 2 --beside nearest "
+        f"render studies/x.yaml {OTHER} --arm full --seed 1 --agents 6 --targets 7 --episode 2 --beside nearest "
         "--frames 3 --out o.gif",
         {
             "pipelines.policies.evaluation.of_study": [SimpleNamespace(saved="saved")],
             "pipelines.policies.render.render": "",
         },
-        ("of_study(x@large paper 2, work, [full], [1])", "render(saved, o.gif, work, 2, nearest, 3)"),
+        (
+            "of_study(x@large paper 3, work, [full], [1])",
+            "render(saved, o.gif, work, 2, nearest, 3, EvaluationEpisodes(episodes=None, seed=None, agents=6, "
+            "targets=7))",
+        ),
+    ),
+    Case(
+        "render p.pt --config c.yaml --out o.gif",
+        {
+            "pipelines.policies.evaluation.of_file": SimpleNamespace(saved="saved"),
+            "pipelines.policies.render.render": "",
+        },
+        (
+            "of_file(p.pt, c.yaml)",
+            "render(saved, o.gif, work, 0, None, 40, EvaluationEpisodes(episodes=None, seed=None, agents=None, "
+            "targets=None))",
+        ),
     ),
     Case(
         f"export studies/x.yaml {OTHER} --out o",

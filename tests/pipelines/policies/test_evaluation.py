@@ -58,6 +58,7 @@ def test_a_kept_policy_scores_what_its_run_ended_with(policy: tuple[Path, Metric
     found = score(of_file(file, None), EvaluationEpisodes())
     assert found.values == final(last)
     assert (found.arm, found.seed, found.source, found.episodes) == ("slow", 0, "finished", 8)
+    assert (found.task["agents"], found.task["kind"], found.changed) == (2, "navigation", {})
     assert found.values["return_sem"] > 0
 
 
@@ -80,6 +81,9 @@ def test_every_method_acts_with_other_numbers_on_the_pairwise_encoder_only(kind:
                 score(policy, EvaluationEpisodes(agents=n, targets=m)).values["return"] for n, m in ((3, 4), (5, 2))
             ]
             assert len({last["final/return"], *found}) == 3
+            played = score(policy, EvaluationEpisodes(episodes=2, seed=7, agents=3))
+            assert played.changed == {"agents": 3, "episodes": 2, "eval_seed": 7}
+            assert (played.task["agents"], played.task["targets"], played.eval_seed) == (3, 2, 7)
         else:
             with pytest.raises(InputError, match="acts only with the numbers that it was trained with"):
                 score(policy, EvaluationEpisodes(agents=3, targets=4))

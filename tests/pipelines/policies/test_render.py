@@ -1,6 +1,7 @@
 """Animations: what they show is what happened, they are small, and they change nothing."""
 
 import io
+import json
 from pathlib import Path
 
 import pytest
@@ -210,6 +211,40 @@ def test_the_command_draws_a_file(
     assert said.startswith("--beside: 'best_windows' is not allowed; ")
     assert said.endswith("did you mean 'best_window'?\n")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.gif", "policy.pt"]
+
+
+def test_what_evaluate_plays_is_drawn_with_the_same_options(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    one = run("iql")
+    wide = one.model_copy(update={"algo": one.algo.model_copy(update={"encoder": "pairwise"})})
+    policy.save(tmp_path / "wide.pt", saved(wide))
+    policy.save(tmp_path / "flat.pt", saved(one))
+    drawn: list[int] = []
+    monkeypatch.setattr(render, "gif", lambda env, *_: drawn.append(env.agents) or b"")
+    played = {}
+    for agents in (one.env.agents, one.env.agents + 1):
+        words = ("wide.pt", "--agents", str(agents))
+        assert run_rhmc("render", *words, "--out", "a.gif", "--beside", "hold") == 0
+        assert run_rhmc("evaluate", *words, "--episodes", "2", "--json") == 0
+        (played[agents],) = json.loads(capsys.readouterr().out)
+        assert run_rhmc("evaluate", *words, "--episodes", "2") == 0
+        told = "episodes=2" if agents == one.env.agents else f"agents={agents}, episodes=2"
+        said = capsys.readouterr().out.splitlines()[0]
+        assert said.startswith(f"coverage (agents={agents}, targets=")
+        assert said.endswith(f"; other than in the run's own evaluation: {told}")
+    assert drawn == [found["task"]["agents"] for found in played.values()] == list(played)
+    for verb, more in {"render": ("--out", "b.gif"), "evaluate": ()}.items():
+        for words, error in {
+            ("flat.pt", "--agents", "5"): "--agents or --targets: iql with encoder 'mlp' acts only with the numbers",
+            ("wide.pt", "--agents", "9"): "--agents: 9 sensors need as many boxes, and there are 6",
+            ("wide.pt", "--set", "steps=1"): "--set: belongs to a study, and wide.pt is one policy",
+            ("wide.pt", "--arm", "a"): "--arm: belongs to a study, and wide.pt is one policy",
+            ("x.yaml", "--config", "c.yaml"): "--config: belongs to a .pt file, and x.yaml is a study",
+        }.items():
+            assert run_rhmc(verb, *words, *more) == 2
+            assert capsys.readouterr().err.startswith(error)
 
 
 def test_a_run_of_the_log_is_drawn_and_an_unfinished_one_is_not(home: Path, tmp_path: Path) -> None:

@@ -16,7 +16,8 @@ from rhmc.training.trainer import Trainer
 from rhmc.yardsticks.scores import play_yardsticks
 from tests.pipelines.own_package import untouched
 
-PAGE = (Path(__file__).parents[3] / "docs/extending.md").read_text(encoding="utf-8")
+ROOT = Path(__file__).parents[3]
+PAGE = (ROOT / "docs/extending.md").read_text(encoding="utf-8")
 
 
 @pytest.fixture(autouse=True)
@@ -24,6 +25,21 @@ def _alone() -> Iterator[None]:
     with untouched():
         yield
     identity._code.cache_clear()
+
+
+def test_the_changes_that_the_page_counts_can_be_made_to_the_code_as_it_is() -> None:
+    table = dict(re.findall(r"^\| \[an? (\w+)\]\(#\S+\) (\|.*)$", PAGE, re.MULTILINE))
+    counted = {name: [int(cell) for cell in row.strip("|").split("|")] for name, row in table.items()}
+    pages = re.findall(r"```python\n(# mine/.*?)```", PAGE, re.DOTALL)
+    found = {name: [1, text.count("\n"), 0] for name, text in zip(("method", "task"), pages, strict=True)}
+    for name, diff in re.findall(r"### An? (\w+)\n.*?```diff\n(.*?)```", PAGE, re.DOTALL):
+        parts = [part.splitlines() for part in diff.split("+++ b/")[1:]]
+        for file, *lines in parts:
+            code = (ROOT / file).read_text(encoding="utf-8")
+            assert [line for line in lines if line[0] == "-" and line[1:] not in code] == []
+        signs = [line[0] for _, *lines in parts for line in lines]
+        found[name] = [len(parts), signs.count("+"), signs.count("-")]
+    assert found == counted
 
 
 def test_the_package_of_the_page_learns_is_continued_scored_and_drawn(tmp_path: Path) -> None:

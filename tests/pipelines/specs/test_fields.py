@@ -23,6 +23,12 @@ def test_every_setting_is_there_once(kind: str) -> None:
     assert all(row.allowed and row.default for row in rows)
 
 
+@pytest.mark.parametrize("kind", MODELS)
+def test_every_setting_has_a_meaning(kind: str) -> None:
+    """`rhmc methods KIND`, `rhmc tasks KIND` and the reference show it: `Field(..., description=...)`."""
+    assert [row.name for row in described(MODELS[kind]) if not row.meaning] == []
+
+
 def test_a_bound_a_list_and_a_block_in_words() -> None:
     rows = {row.name: row for row in described(ALGORITHMS["rhmc"].config)}
     assert rows["alpha"] == Described("alpha", "number at least 0, at most 1", "0.1", "alpha_1 of Eq. 6")
@@ -46,7 +52,7 @@ def tried(allowed: str) -> list[tuple[Any, bool]]:
     if allowed == "true, false":
         return [(True, True), (False, True), ("perhaps", False)]
     if not allowed.startswith(("number", "whole number")):
-        words = allowed.split(", ") if allowed not in ("list", "text") else []
+        words = allowed.split(", ") if allowed not in ("list", "text", "text or null") else []
         return [(word, True) for word in words] + ([("no such word", False)] if words else [])
     values: list[tuple[Any, bool]] = [("many", False)]
     if "at least" in allowed:

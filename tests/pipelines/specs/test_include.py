@@ -185,6 +185,86 @@ def test_another_kind_must_state_what_all_have_in_common_also_when_included() ->
     assert "algo.encoder: missing; another kind inherits nothing, and the base has 'pairwise'" in lines[0]
 
 
+# Presets
+
+TUNED = """\
+question: Which?
+preset: tuned
+base:
+  env: {kind: coverage}
+  algo: {kind: rhmc}
+arms:
+  RHMC: {}
+  six steps: {algo: {horizon: 6}}
+  QMIX: {algo: {kind: qmix, lr: 3e-3}}
+  elsewhere: {env: {kind: navigation, observation: extended}}
+seeds: 1
+steps: 1000000
+"""
+TUNED_BY_HAND = """\
+question: Which?
+base:
+  env: {include: settings/coverage}
+  algo: {include: settings/coverage/rhmc}
+  trainer: {include: settings/coverage}
+arms:
+  RHMC: {}
+  six steps: {algo: {horizon: 6}}
+  QMIX: {algo: {include: settings/coverage/qmix, lr: 3e-3}}
+  elsewhere:
+    env: {include: settings/navigation}
+    algo: {include: settings/navigation/rhmc}
+    trainer: {final_lr_fraction: 1}
+seeds: 1
+steps: 1000000
+"""
+
+
+def test_tuned_is_what_the_settings_of_each_runs_task_and_method_say() -> None:
+    ids = [run.spec.id for run in load(TUNED_BY_HAND).runs()]
+    assert [run.spec.id for run in load(TUNED).runs()] == ids
+    assert [run.spec.id for run in load(TUNED.replace("preset: tuned\n", ""), "preset=tuned").runs()] == ids
+    assert load(TUNED).remarks == ()
+
+
+def test_paper_is_the_defaults_said_aloud() -> None:
+    text = changed("tuned", "paper", TUNED).replace(", observation: extended", "")
+    assert [run.spec.id for run in load(text).runs()] == [
+        run.spec.id for run in load(changed("preset: paper\n", "", text)).runs()
+    ]
+
+
+def test_settings_of_ones_own_go_before_the_packages_in_a_preset_too() -> None:
+    Path("studies/settings/coverage").mkdir(parents=True)
+    Path("studies/settings/coverage/qmix.yaml").write_text("algo:\n  kind: qmix\n  gama: 0.5\n")
+    assert any(
+        line.startswith("studies/settings/coverage/qmix.yaml:3:3: algo.gama: unknown key 'gama'; ")
+        for line in faults(TUNED)
+    )
+    Path("studies/settings/coverage/qmix.yaml").write_text("algo: {kind: qmix, gamma: 0.5}\n")
+    arms = load(TUNED).arms
+    assert (arms["QMIX"].algo.gamma, arms["QMIX"].algo.lr, arms["RHMC"].algo.horizon) == (0.5, 3e-3, 1)
+    names = [path.name for path in closure(Path("studies/x.yaml"))]
+    assert {"qmix.yaml", "navigation.yaml", "coverage.yaml"} <= set(names)
+
+
+def test_an_unknown_preset_is_one_line_with_the_nearest_name() -> None:
+    said = "studies/x.yaml:2:9: preset: 'tuend' is not allowed; allowed: tuned, paper; did you mean 'tuned'?"
+    assert faults(changed("tuned", "tuend", TUNED)) == [said]
+
+
+def test_a_base_that_states_what_all_share_is_still_asked_of_other_kinds() -> None:
+    lines = faults(changed("{kind: rhmc}", "{kind: rhmc, encoder: mlp}", TUNED))
+    assert "algo.encoder: missing; another kind inherits nothing, and the base has 'mlp'" in lines[0]
+
+
+def test_a_method_without_tuned_settings_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("pipelines.specs.include.SHIPPED", tmp_path / "none")
+    assert load(TUNED).remarks[0] == (
+        "studies/x.yaml:2:9: preset: no tuned settings for 'rhmc' in 'coverage': what is not stated has its default"
+    )
+
+
 # Files that include others, and where names start
 
 

@@ -32,6 +32,12 @@ def test_what_a_study_includes_comes_with_it_and_nothing_else(tmp_path: Path) ->
     assert other == {"steadiness.yaml", "settings/coverage.yaml", "settings/coverage/rhmc.yaml"}
 
 
+def test_a_tuned_study_is_copied_with_the_settings_of_its_methods(tmp_path: Path) -> None:
+    found = {path.relative_to(tmp_path).as_posix() for path in copy("template", tmp_path)}
+    settings = {f"settings/coverage{end}.yaml" for end in ("", "/rhmc", "/iql", "/values")}
+    assert found == {"template.yaml"} | settings
+
+
 def test_a_copied_study_takes_what_was_copied_with_it(tmp_path: Path) -> None:
     file, *others = copy("navigation", tmp_path / "mine")
     (tuned,) = [path for path in others if path.parts[-2:] == ("coverage", "rhmc.yaml")]

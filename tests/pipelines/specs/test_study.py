@@ -424,7 +424,8 @@ def test_an_unknown_variant() -> None:
 # Faulty files. Each: what is written instead of what, and what is said, `...` for a long list in the middle.
 
 EMPTY = (
-    "1:1: empty; a study has question, base, arms, grid, readings, variants, seeds, steps, profiles, resources, imports"
+    "1:1: empty; a study has question, preset, base, arms, grid, readings, variants, seeds, steps, profiles, "
+    "resources, imports"
 )
 WHOLE = [
     ("", EMPTY),
