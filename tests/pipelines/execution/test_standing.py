@@ -4,6 +4,7 @@ import io
 import json
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -105,7 +106,7 @@ def change_the_file(file: Path, home: Home) -> None:
 def bring_up_to_date(file: Path, home: Home) -> None:
     import sqlite3
 
-    with sqlite3.connect(home.database) as database:
+    with closing(sqlite3.connect(home.database)) as database, database:
         database.execute("UPDATE alembic_version SET version_num = 'another'")
 
 
