@@ -61,8 +61,16 @@ class StudyError(InputError):
     """Every fault of a study, one a line."""
 
     def __init__(self, faults: Sequence[Fault]) -> None:
-        self.faults = sorted(set(faults), key=lambda f: (f.place.source.startswith("--set"), *f))
+        self.faults = sorted(_once(faults), key=lambda f: (f.place.source.startswith("--set"), *f))
         super().__init__(*map(str, self.faults))
+
+
+def _once(faults: Iterable[Fault]) -> list[Fault]:
+    """Each fault once; where several methods refuse a value, that of the method that allows least."""
+    found: dict[tuple[Any, ...], Fault] = {}
+    for fault in sorted(faults, key=lambda fault: len(fault.text)):
+        found.setdefault((fault.place, fault.path, fault.text.partition(" is not allowed; allowed:")[0]), fault)
+    return list(found.values())
 
 
 def fields() -> list[str]:

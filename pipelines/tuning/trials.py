@@ -360,8 +360,13 @@ def opened(home: Home, *, write: bool = True) -> Iterator[BaseStorage | None]:
         yield storage
     finally:
         if isinstance(storage, RDBStorage):
-            storage.remove_session()
-            storage.engine.dispose()
+            close(storage)
+
+
+def close(storage: RDBStorage) -> None:
+    """Close its connections: the session's, which is in use until then, and those that wait."""
+    storage.remove_session()
+    storage.engine.dispose()
 
 
 def _open(url: str, write: bool) -> BaseStorage | None:
@@ -386,7 +391,7 @@ def _create(file: Path) -> None:
             return
         part = part_of(file)
         try:
-            RDBStorage(address(part)).engine.dispose()
+            close(RDBStorage(address(part)))
             part.replace(file)
         finally:
             remove(part)

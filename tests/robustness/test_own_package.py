@@ -153,7 +153,8 @@ def test_a_bundle_of_it_imports_nothing_that_nobody_named(launched: Launched, rh
         for name in [name for name in sys.modules if name.partition(".")[0] == "bandits"]:
             patch.delitem(sys.modules, name)
         for table in _registered():
-            patch.delitem(table, next(kind for kind in ("bandits", "ring") if kind in table))
+            for kind in {"bandits", "ring"} & table.keys():
+                patch.delitem(table, kind)
         patch.setattr("pipelines.workspace.own_packages._named", {})
         patch.setenv("RHMC_HOME", str(tmp_path / "there"))
         patch.syspath_prepend(launched.folder / "studies")  # it could be imported

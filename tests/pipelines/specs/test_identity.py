@@ -285,8 +285,8 @@ EDITS = {
     "a task": ("envs/navigation.py", "DT = 0.1", "DT = 0.2", set(ALGORITHMS), {"navigation"}),
     "a field of the trainer's settings": (
         "training/trainer.py",
-        '    device: str = "cpu"\n',
-        '    device: str = "cpu"\n    extra: int = 0\n',
+        "    threads: int = ",
+        "    extra: int = 0\n    threads: int = ",
         set(ALGORITHMS),
         set(ENVS),
     ),
@@ -394,6 +394,8 @@ def other(field: FieldInfo) -> list[Any]:
         return [default / 2, default + 0.25]
     if isinstance(default, str):
         return ["cuda", "another"]
+    if any(getattr(one, "pattern", None) for one in field.metadata):
+        return ["0" * 16, "f" * 16]  # a digest
     if isinstance(default, tuple):
         return [default[::-1]]
     return [1, 2, 0.5]

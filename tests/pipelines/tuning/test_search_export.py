@@ -13,7 +13,7 @@ import pytest
 from pipelines.specs.study import Setting
 from pipelines.tuning import search_export
 from pipelines.tuning.search_export import export_search
-from pipelines.tuning.trials import open_storage
+from pipelines.tuning.trials import opened
 from pipelines.workspace.work_folder import Home
 from reports.data.schema import TRIALS
 from tests.pipelines.support import CODE, Said, run_rhmc
@@ -192,7 +192,8 @@ def test_what_cannot_be_read_or_written_is_one_line(
 def test_a_search_in_the_work_folder_is_read(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     search = load(GOOD, "quick", "trials=2")
     (tmp_path / "work").mkdir()
-    World(search, tmp_path, open_storage(Home(tmp_path / "work"))).launch()
+    with opened(Home(tmp_path / "work")) as storage:
+        World(search, tmp_path, storage).launch()
     said = rhmc(capfd, "studies/search_x.yaml", "--set", "trials=2")
     assert (said.code, said.err) == (0, "next:  rhmc report --study studies/search_x.yaml\n")
     assert set(pd.read_parquet(f"results/quick/runs/{NAME}")["state"]) == {"complete"}

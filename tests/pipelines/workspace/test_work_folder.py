@@ -24,7 +24,7 @@ from pipelines.tracking.mlflow_tracker import MlflowTracker, fetch, open_existin
 from pipelines.tracking.plan import items, study_card
 from pipelines.tracking.policy import FILE, Saved, load, save
 from pipelines.tuning.search_run import show_search
-from pipelines.tuning.trials import ArmStudy, look, open_storage, opened
+from pipelines.tuning.trials import ArmStudy, look, opened
 from pipelines.workspace import relocation, sqlite
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.work_folder import Home, StoreError, work_folder
@@ -402,12 +402,12 @@ def test_who_drives_a_study_is_seen_without_a_file_being_touched(old: Path) -> N
 
 def test_looking_at_a_search_makes_no_study_in_it(old: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     search = searched(old)
-    storage = open_storage(Home(old), write=False)
-    assert storage is not None
-    assert look(search, "one", storage)[0].counts()["running"] == 1
     before = (old / "optuna.db").read_bytes()
-    monkeypatch.setattr("pipelines.specs.search.code_id", lambda *place: "0ther")
-    assert look(search, "one", storage)[1] == 1
+    with opened(Home(old), write=False) as storage:
+        assert storage is not None
+        assert look(search, "one", storage)[0].counts()["running"] == 1
+        monkeypatch.setattr("pipelines.specs.search.code_id", lambda *place: "0ther")
+        assert look(search, "one", storage)[1] == 1
     assert (old / "optuna.db").read_bytes() == before
 
 
