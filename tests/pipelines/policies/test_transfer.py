@@ -36,8 +36,8 @@ def test_the_table_holds_what_evaluation_says(tmp_path: Path) -> None:
         [3, 2, 2, 2],
     ]
     for row in table.itertuples():
-        played = score(one, EvaluationEpisodes(episodes=8, agents=int(str(row.agents))))
-        assert (row.value, row.sem) == (played.values["return"], played.values["return_sem"])
+        played = score(one, EvaluationEpisodes(episodes=8, agents=int(str(row.agents))))._asdict()["values"]
+        assert (row.value, row.sem) == (played["return"], played["return_sem"])
     assert set(table["run"]) == {one.saved.spec.id}
 
 
