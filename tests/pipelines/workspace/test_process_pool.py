@@ -145,8 +145,8 @@ def test_nothing_is_left_of_a_command_that_is_stopped(
             os.killpg(process.pid, how)
         else:
             process.send_signal(how)
-        assert process.wait(30) == (130 if how == signal.SIGINT else -how)
-        end = time.monotonic() + 30
+        assert process.wait(LONG) == (130 if how == signal.SIGINT else -how)
+        end = time.monotonic() + LONG
         while (left := started_by(process.pid)) and time.monotonic() < end:
             time.sleep(0.02)
         assert left == []
