@@ -13,7 +13,7 @@ SHELL := bash
 
 PIP_TORCH_ARGS ?=
 # Tests wait for processes that they start, so there is one more than processors; each may have a Ray of its own.
-CORES := $(shell getconf _NPROCESSORS_ONLN)
+CORES := $(shell getconf _NPROCESSORS_ONLN || echo 2)
 JOBS ?= $(shell echo $$(( $(CORES) < 8 ? $(CORES) + 1 : 8 )))
 KILLS ?= 60
 SEED ?= 0
