@@ -3,7 +3,7 @@
 #
 #   PYTHON=...           the Python to use, where `python3.11` is not on the path
 #   PIP_TORCH_ARGS=...   options for the installation of torch alone, such as the index that has its CPU build
-#   JOBS=2               tests at once
+#   JOBS=N               tests at once: one more than there are processors if not given, at most 8
 #   KILLS=60 SEED=0      of `make soak`
 
 SHELL := bash
@@ -12,7 +12,9 @@ SHELL := bash
 .DEFAULT_GOAL := help
 
 PIP_TORCH_ARGS ?=
-JOBS ?= 2
+# Tests wait for processes that they start, so there is one more than processors; each may have a Ray of its own.
+CORES := $(shell getconf _NPROCESSORS_ONLN || echo 2)
+JOBS ?= $(shell echo $$(( $(CORES) < 8 ? $(CORES) + 1 : 8 )))
 KILLS ?= 60
 SEED ?= 0
 FITS := -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))'
@@ -53,7 +55,7 @@ repro: $(READY) ## Train, track and report on the profile in params.yaml; an int
 test: check ## Lint, types and every test
 	@python -m pytest -n $(JOBS) $(SHARED)
 
-deep: $(READY) ## Every test, with many more random kills and examples: before a release
+deep: $(READY) ## Every test in every case, with many more random kills and examples: before a release
 	@DEEP=1 python -m pytest -n $(JOBS) $(SHARED)
 
 check: $(READY) ## Lint and types only
@@ -88,8 +90,9 @@ clean: ## Remove .venv and caches; results stay
 	@find rhmc pipelines reports benchmarks tests -name __pycache__ -prune -exec rm -rf {} +
 	@echo "Removed .venv and the caches. Kept every result: work/ (runs, checkpoints) and results/ (remove by hand)."
 
-# torch comes first and alone, so that a build with CUDA is seen before its packages are fetched. Nothing is compiled
-# here: two thirds of the packages' code is never imported, and Python keeps what it compiles of the rest.
+# torch comes first and alone, so that a build with CUDA is seen before its packages are fetched. The lock is complete,
+# which `pip check` makes sure of: nothing has to be resolved, and two processes install 40 packages at a time. Nothing is
+# compiled here: two thirds of the packages' code is never imported, and Python keeps what it compiles of the rest.
 $(READY): requirements.lock pyproject.toml
 	@test -n "$(PYTHON)" || { echo "Python 3.11, 3.12 or 3.13 is needed, and none is on the path." \
 	  "Give its path: make PYTHON=/path/to/python3.11"; exit 1; }
@@ -99,7 +102,7 @@ $(READY): requirements.lock pyproject.toml
 	@test -x .venv/bin/python || $(PYTHON) -m venv .venv
 	@python -m pip install --quiet --no-compile --no-deps $(PIP_TORCH_ARGS) "$$(grep '^torch==' requirements.lock)"
 	@python .ci/cpu_only.py
-	@python -m pip install --quiet --no-compile -r requirements.lock
+	@grep '^[^#]' requirements.lock | xargs -P 2 -n 40 python -m pip install --quiet --no-compile --no-deps
 	@python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	@python .ci/cpu_only.py
 	@python -m pip check

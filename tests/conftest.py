@@ -11,8 +11,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import settings
 
 torch.set_num_threads(1)
+settings.register_profile("tests", deadline=None)  # an example may wait for another test's processes
+settings.load_profile("tests")
 os.environ.pop("MLFLOW_TRACKING_URI", None)
 os.environ.pop("RAY_ADDRESS", None)
 os.environ.setdefault("RAY_worker_niceness", "0")  # else whatever else runs, such as other tests, starves them
@@ -29,10 +32,10 @@ KNOWN = [  # warnings of pinned packages about each other
 ]
 LONGEST = [  # files that take most processor time, so that no process of `pytest -n` has one of them left at the end
     *("conformance/test_algorithms", "robustness/test_cluster", "tuning/test_search", "robustness/test_interrupt"),
-    *("bundles/test_bundle", "robustness/test_faults", "robustness/test_killed", "execution/test_run"),
-    *("execution/test_private_node", "tuning/test_ray_workers", "workspace/test_addresses"),
-    *("workspace/test_work_folder", "robustness/test_malformed", "reports/test_robust", "pages/test_build"),
-    "reports/test_hostile",
+    *("robustness/test_own_package", "golden/test_golden", "bundles/test_bundle", "robustness/test_faults"),
+    *("robustness/test_killed", "execution/test_run", "execution/test_private_node", "tuning/test_ray_workers"),
+    *("workspace/test_addresses", "workspace/test_process_pool", "robustness/test_installed"),
+    *("robustness/test_malformed", "reports/test_robust", "pages/test_build", "reports/test_hostile"),
 ]
 
 

@@ -25,6 +25,7 @@ from rhmc.learning.learner import Learner, Replay
 from rhmc.networks.nets import Unshared
 from rhmc.training.trainer import Config, Trainer
 from rhmc.types import Batch, Obs, Transition
+from tests.depth import covering
 from tests.support import copied
 
 EPISODE = 7  # of both tasks here, so that runs of a few steps cross its end
@@ -68,6 +69,7 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {  # beside the defaults, on b
     "coma critic": ("coma", {"advantage_estimator": "critic"}),
 }
 SCALES = ("none", "reward", "return")
+ENCODERS = ("mlp", "pairwise")
 
 
 class Case(NamedTuple):
@@ -85,12 +87,13 @@ def settle(kind: str, **changes: Any) -> Any:
 
 BASIC = {
     f"{kind}-{encoder}-{task}": Case(settle(kind, encoder=encoder), env)
-    for kind, encoder, (task, env) in product(ALGORITHMS, ("mlp", "pairwise"), TASKS.items())
+    for kind, encoder, (task, env) in covering(ALGORITHMS, ENCODERS, TASKS.items())
 }
 BASIC |= {
     f"{kind}-{encoder}-continuous": Case(settle(kind, encoder=encoder), CONTINUOUS)
-    for kind, encoder in product(ALGORITHMS, ("mlp", "pairwise"))
-    if "continuous" in ALGORITHMS[kind].about.actions
+    for kind, encoder in covering(
+        [kind for kind in ALGORITHMS if "continuous" in ALGORITHMS[kind].about.actions], ENCODERS
+    )
 }
 UNSHARED = {f"{kind} unshared": Case(settle(kind, share=False), TASKS["navigation"]) for kind in ALGORITHMS}
 SCALE = {  # RHMC has one for each level, in variants of its own
@@ -98,15 +101,21 @@ SCALE = {  # RHMC has one for each level, in variants of its own
     for kind, name in product(ALGORITHMS, ("standardise", "coordinator.standardise"))
     if kind != "rhmc" and name in settings(ALGORITHMS[kind].config)
 }
+
+
+def other_scales(kind: str) -> list[str]:
+    """Those that are not the method's default."""
+    return [scale for scale in SCALES if scale != attrgetter(SCALE[kind])(ALGORITHMS[kind].config())]
+
+
 SCALED = {
-    f"{kind} {scale}": Case(settle(kind, **{name: scale}), TASKS["navigation"])
-    for (kind, name), scale in product(SCALE.items(), SCALES)
-    if scale != attrgetter(name)(ALGORITHMS[kind].config())
+    f"{kind} {scale}": Case(settle(kind, **{SCALE[kind]: scale}), TASKS["navigation"])
+    for kind, scale in ((kind, other_scales(kind)[place]) for kind, place in covering(SCALE, (0, 1)))
 }
 CASES = BASIC | UNSHARED | SCALED
 CASES |= {
     f"{name}-{task}": Case(settle(kind, encoder="pairwise", **changes), env)
-    for (name, (kind, changes)), (task, env) in product(VARIANTS.items(), TASKS.items())
+    for (name, (kind, changes)), (task, env) in covering(VARIANTS.items(), TASKS.items())
 }
 basic = pytest.mark.parametrize("case", BASIC.values(), ids=BASIC)
 every = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
@@ -239,7 +248,7 @@ def test_a_run_without_a_step_continues_too() -> None:
 
 @pytest.fixture
 def state() -> Any:
-    run = trainer(CASES["iql-mlp-navigation"])
+    run = trainer(Case(settle("iql", encoder="mlp"), TASKS["navigation"]))
     for _ in range(3):
         next(run)
     return through_a_file(run.state_dict())
@@ -422,10 +431,16 @@ EXTENDED: list[Any] = [
     coverage.Config(agents=4, targets=5, observation="extended_own"),
     navigation.Config(agents=4, observation="extended", episode=EPISODE),
 ]
+extended = pytest.mark.parametrize(
+    ("kind", "cfg"),
+    [
+        pytest.param(*case, id=f"{case[1].kind}-{case[1].observation}-{case[0]}")
+        for case in covering(ALGORITHMS, EXTENDED)
+    ],
+)
 
 
-@pytest.mark.parametrize("kind", ALGORITHMS)
-@pytest.mark.parametrize("cfg", EXTENDED, ids=lambda cfg: f"{cfg.kind}-{cfg.observation}")
+@extended
 def test_reordering_agents_reorders_what_they_do(kind: str, cfg: Any) -> None:
     env, obs = world(cfg, batch=30)
     order, lively = [2, 0, 3, 1], 0
@@ -444,8 +459,7 @@ def test_reordering_agents_reorders_what_they_do(kind: str, cfg: Any) -> None:
     assert lively
 
 
-@pytest.mark.parametrize("kind", ALGORITHMS)
-@pytest.mark.parametrize("cfg", EXTENDED, ids=lambda cfg: f"{cfg.kind}-{cfg.observation}")
+@extended
 def test_pairwise_weights_act_for_another_number_of_agents_and_targets(kind: str, cfg: Any) -> None:
     sizes = {"agents": 3, "targets": 2} if cfg.kind == "coverage" else {"agents": 3}
     algo = settle(kind, encoder="pairwise")
@@ -618,10 +632,10 @@ ON_POLICY = {
 }
 
 
-@pytest.mark.parametrize("flag", ["terminated", "truncated", None])
-@pytest.mark.parametrize("case", ON_POLICY.values(), ids=ON_POLICY)
-def test_a_sequence_stops_where_an_episode_ends(case: Case, flag: str | None) -> None:
+@pytest.mark.parametrize(("name", "flag"), covering(ON_POLICY, ("terminated", "truncated", None)))
+def test_a_sequence_stops_where_an_episode_ends(name: str, flag: str | None) -> None:
     """The next episode does not affect the step before; within an episode it is."""
+    case = ON_POLICY[name]
     env, obs = world(case.env, batch=1)
     found = []
     for shift in (0.0, 1.0):
@@ -694,8 +708,7 @@ def assert_learned(found: Iterator[float]) -> None:
     assert last > 0.85 * best
 
 
-@pytest.mark.parametrize("encoder", ["mlp", "pairwise"])
-@pytest.mark.parametrize("kind", ALGORITHMS)
+@pytest.mark.parametrize(("kind", "encoder"), covering(ALGORITHMS, ENCODERS, shift=1))
 def test_every_method_learns_the_tiny_task(kind: str, encoder: str) -> None:
     assert_learned(returns(kind, encoder=encoder))
 
@@ -726,8 +739,7 @@ def test_rhmc_learns_in_its_variants(changes: dict[str, Any]) -> None:
     assert_learned(returns("rhmc", encoder="pairwise", **changes))
 
 
-@pytest.mark.parametrize("encoder", ["mlp", "pairwise"])
-@pytest.mark.parametrize("kind", ALGORITHMS)
+@pytest.mark.parametrize(("kind", "encoder"), covering(ALGORITHMS, ENCODERS))
 def test_unshared_agents_learn_apart_and_act_by_their_own_networks(kind: str, encoder: str) -> None:
     run = trainer(Case(settle(kind, encoder=encoder, share=False), TASKS["navigation"]))
     teams, fresh = (unshared(each.algorithm) for each in (run, trainer(Case(run.algorithm.cfg, run.env_cfg))))

@@ -23,6 +23,7 @@ from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import coverage
 
 CODE = code_id("iql", "navigation")  # of all runs here
+HOSTILE = "#x ?y %2F z'\"~{a}\n"  # the name of a folder
 
 
 def setting(**algo: Any) -> Setting:

@@ -1,7 +1,8 @@
-"""A driver that is killed, terminated or interrupted; the next launch must end where one launch would.
+"""A driver that is terminated or interrupted; the next launch must end where one launch would.
 
-The same for its workers, which are Ray's here; more kills, without Ray, are in `test_faults.py`. What nobody disturbs
-is trained in this process: it must be equal wherever it is trained, and a worker takes seconds to start.
+The same for its workers, which are Ray's here. A killed driver with such workers is in `test_own_package.py`; more
+kills, without Ray, are in `test_faults.py`. What nobody disturbs is trained in this process: it must be equal wherever
+it is trained, and a worker takes seconds to start.
 """
 
 import os
@@ -40,9 +41,9 @@ def uninterrupted(tmp_path_factory: pytest.TempPathFactory, template: Path) -> b
     return (home / "out" / "tiny.parquet").read_bytes()
 
 
-def driver(home: Path, concurrent: int) -> subprocess.Popen[str]:
-    """Launch the study in a process of its own and wait for its first checkpoint."""
-    words = [str(home), str(POINTS), str(concurrent)]
+def driver(home: Path) -> subprocess.Popen[str]:
+    """Launch the study in a process of its own, both runs at once, and wait for its first checkpoint."""
+    words = [str(home), str(POINTS), "2"]
     command = [sys.executable, "-W", "ignore", "-m", "tests.pipelines.support", *words]
     root = Path(__file__).parents[2]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
@@ -80,15 +81,6 @@ def finish(home: Path, expected: bytes, launch: Callable[[Study, Path], int] = l
     assert not list(home.glob("checkpoints/*/*.pt"))
 
 
-def test_a_killed_driver(home: Path, uninterrupted: bytes) -> None:
-    process = driver(home, concurrent=1)
-    process.kill()
-    process.communicate()
-    assert all_end(process.pid, WORKER)  # Ray's own agents take a minute more to miss their raylet
-    assert "running" in statuses(home).values()  # nobody was left to say otherwise
-    finish(home, uninterrupted)
-
-
 def test_an_interrupted_launch(
     home: Path, uninterrupted: bytes, cluster: None, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -115,7 +107,7 @@ def newest(home: Path) -> int:
 
 
 def test_killed_workers_and_a_terminated_driver(home: Path, uninterrupted: bytes) -> None:
-    process = driver(home, concurrent=2)
+    process = driver(home)
     workers = started_by(process.pid, WORKER)
     assert workers
     for worker in workers:

@@ -8,12 +8,16 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import pandas as pd
 import pytest
 
 from pipelines.specs import identity
 from pipelines.specs.study import RunSpec, Study
+from pipelines.tracking.mlflow_tracker import open_existing
+from pipelines.tracking.tracker import StudyCard
+from pipelines.workspace.work_folder import Home
 from rhmc.training.trainer import Trainer
 from tests.pipelines.own_package import STUDY, untouched, write
 from tests.pipelines.support import Said, all_end, run_rhmc
@@ -44,11 +48,15 @@ for words in {calls!r}:
 Rhmc = Callable[..., Said]
 
 
-class Launched:
+CARD = StudyCard("own", "quick", "", {}, [])
+
+
+class Launched(NamedTuple):
     """The folder of a user after two launches, of which the first was killed."""
 
-    def __init__(self, folder: Path, said: str) -> None:
-        self.folder, self.said = folder, said
+    folder: Path
+    left: dict[str, str]  # the status of each run in the log after the first, by its id
+    said: str  # by the second
 
 
 @pytest.fixture(scope="module")
@@ -70,9 +78,17 @@ def launched(tmp_path_factory: pytest.TempPathFactory, template: Path) -> Launch
         process.kill()
     assert process.wait() == -9, (folder / "first.txt").read_text()
     assert all_end(process.pid, WORKER)  # Ray's own agents take a minute more to miss their raylet
+    left = statuses(home)
     done = subprocess.run([*COMMAND, "study", "run", OWN], capture_output=True, text=True, check=False, **how)  # type: ignore[call-overload]
     assert done.returncode == 0, done.stdout + done.stderr
-    return Launched(folder, done.stdout + done.stderr)
+    return Launched(folder, left, done.stdout + done.stderr)
+
+
+def statuses(home: Path) -> dict[str, str]:
+    """The status of each run in the log, by its id."""
+    tracker = open_existing(CARD, Home(home))
+    assert tracker is not None
+    return {run.ref: run.status for run in tracker.recorded()}
 
 
 @pytest.fixture
@@ -94,6 +110,25 @@ def trained(spec: RunSpec) -> dict[tuple[int, str], float]:
     """The values of a run that nobody interrupted, in this process."""
     points = list(Trainer(spec.env, spec.algo, spec.trainer, spec.seed))
     return {(int(point["step"]), name): value for point in points for name, value in point.items() if name != "step"}
+
+
+@pytest.mark.ray
+def test_a_killed_driver(launched: Launched) -> None:
+    """What it leaves open the next launch takes up: the same runs, whole, nothing doubled."""
+    home = launched.folder / "work"
+    assert "running" in launched.left.values()  # nobody was left to say otherwise
+    after = statuses(home)
+    assert launched.left.keys() <= after.keys()
+    assert list(after.values()) == ["finished"] * 3
+    tracker = open_existing(CARD, Home(home))
+    assert tracker is not None
+    points = []
+    for ref in after:
+        steps = [value.step for value in tracker.client.get_metric_history(ref, "return")]
+        assert len(steps) == len(set(steps))
+        points.append(len(steps))
+    assert sorted(points) == [3, 31, 31]
+    assert not list(home.glob("checkpoints/*/*.pt"))
 
 
 @pytest.mark.ray

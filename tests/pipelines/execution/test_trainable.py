@@ -32,6 +32,7 @@ from pipelines.workspace.work_folder import (
 )
 from rhmc.algorithms import ALGORITHMS
 from rhmc.training.trainer import Trainer
+from tests.depth import covering
 from tests.pipelines.support import setting, spec
 from tests.robustness.chaos import DAMAGES, damaged
 
@@ -318,23 +319,22 @@ def wild(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, float, int], None]:
     return become
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize(
-    ("name", "shown"),
-    [
-        ("train/td_loss", "train/td_loss"),
-        ("eval/return", "eval/return"),
-        ("final/return", "final/return"),
-        ("a weight", "learners.0.net.agents.net.0.weight"),
-    ],
-)
+WHERE = {
+    "train/td_loss": "train/td_loss",
+    "eval/return": "eval/return",
+    "final/return": "final/return",
+    "a weight": "learners.0.net.agents.net.0.weight",
+}
+
+
+@pytest.mark.parametrize(("name", "value"), covering(WHERE, [math.nan, math.inf, -math.inf]))
 def test_a_value_that_is_not_finite_fails_the_run_and_is_not_kept(
-    start: Start, tmp_path: Path, wild: Callable[[str, float, int], None], name: str, shown: str, value: float
+    start: Start, tmp_path: Path, wild: Callable[[str, float, int], None], name: str, value: float
 ) -> None:
     wild(name, value, at := 3 if name == "final/return" else 2)
     results = finish(start())
     last = results[-1]
-    assert last["error"].startswith(f"diverged: {shown} is {value} at step {200 * at}; ")
+    assert last["error"].startswith(f"diverged: {WHERE[name]} is {value} at step {200 * at}; ")
     assert (last["diverged"], last["points"]) == (True, [])
     assert [len(r["points"]) for r in results] == [1] * at + [0]
     kept = sorted(file.name for file in (tmp_path / "a" / "run0").iterdir())

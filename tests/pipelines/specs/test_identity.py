@@ -1,5 +1,6 @@
 """A run's name: another one exactly where its settings or the code that decides it may be other."""
 
+import json
 import os
 import shutil
 import subprocess
@@ -25,6 +26,7 @@ from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import ENVS
 from rhmc.hierarchy.coordinator import COORDINATORS
 from rhmc.training.trainer import Config as TrainerConfig
+from tests.depth import DEEP
 
 ROOT = Path(__file__).parents[3]
 PLACES = [(method, task) for method in ALGORITHMS for task in ENVS]
@@ -189,8 +191,8 @@ def test_a_module_that_does_not_parse_is_an_error(toy: Path) -> None:
         digests(toy)
 
 
-def pythons() -> list[str]:
-    """This Python, and one of each other version that works here."""
+def other_pythons() -> list[str]:
+    """One of each other version that works here."""
     found = [str(one) for one in Path(os.environ.get("PYENV_ROOT", "/nowhere")).glob("versions/3.1[123].*/bin/python")]
     found += [f"python3.{minor}" for minor in (11, 12, 13)]
     ask, works = "import sys; print(sys.version_info[:2])", {f"{sys.version_info[:2]}": sys.executable}
@@ -198,19 +200,22 @@ def pythons() -> list[str]:
         said = subprocess.run([one, "-c", ask], capture_output=True, text=True, check=False)
         if said.returncode == 0:
             works.setdefault(said.stdout.strip(), one)
-    return list(works.values())
+    return list(works.values())[1:]
 
 
 def test_every_python_names_the_code_alike() -> None:
-    """Of all modules of the project; only the versions that are installed can say."""
+    """All that is installed with the project, and in `make deep` its tests; only versions that are here can say."""
+    packages = ("rhmc", "pipelines", "reports", *(("tests",) if DEEP else ()))
+    code = Code({name: ROOT / name for name in packages})
+    here = {name: code.digest(name) for name in code.sources}
+    assert len(here) > 100
     program = (
-        "import sys, pathlib; sys.path.insert(0, 'pipelines/specs'); import syntax\n"
-        "code = syntax.Code({name: pathlib.Path(name) for name in ('rhmc', 'pipelines', 'reports', 'tests')})\n"
-        "print(*(f'{name} {code.digest(name)}' for name in sorted(code.sources)), sep='\\n')"
+        "import json, sys, pathlib; sys.path.insert(0, 'pipelines/specs'); import syntax\n"
+        f"code = syntax.Code({{name: pathlib.Path(name) for name in {packages}}})\n"
+        "print(json.dumps({name: code.digest(name) for name in code.sources}))"
     )
-    said = {subprocess.check_output([one, "-c", program], cwd=ROOT, text=True) for one in pythons()}
-    assert len(said) == 1
-    assert len(said.pop().splitlines()) > 100
+    for python in other_pythons():
+        assert json.loads(subprocess.check_output([python, "-c", program], cwd=ROOT, text=True)) == here, python
 
 
 # The code of a run

@@ -22,6 +22,7 @@ from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import make_env
 from rhmc.training.trainer import Trainer
 from rhmc.types import Obs
+from tests.depth import covering
 from tests.pipelines.support import plan, spec, tiny
 
 COVERAGE = {"kind": "coverage", "agents": 2, "targets": 3}
@@ -192,8 +193,7 @@ STEPS = (
 )
 
 
-@pytest.mark.parametrize("step", STEPS)
-@pytest.mark.parametrize("done", [False, True])
+@pytest.mark.parametrize(("step", "done"), covering(STEPS, [False, True]))
 def test_a_launch_killed_at_any_step_of_registering_leaves_one_model_to_the_next(
     home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str, done: bool
 ) -> None:

@@ -313,7 +313,7 @@ def test_a_server_of_this_machine_is_asked_past_a_proxy(
 def test_the_web_interface_comes_up_behind_a_proxy_and_ends_whole(shown: Shown) -> None:
     with socket.socket() as probe:
         assert probe.connect_ex(("127.0.0.1", shown.port)) != 0
-    end = time.monotonic() + 10
+    end = time.monotonic() + 60  # on a busy machine
     while started_by(shown.pid) and time.monotonic() < end:
         time.sleep(0.1)
     assert not started_by(shown.pid)

@@ -15,6 +15,7 @@ import torch
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.process_pool import side_by_side
 from pipelines.workspace.work_folder import StoreError
+from tests.depth import covering
 from tests.pipelines.support import started_by
 from tests.pipelines.workspace.pooled import faulty, first_after_last, killed, shared, sleepy, told
 
@@ -57,9 +58,11 @@ def test_one_at_a_time_is_this_process_and_takes_an_item_when_its_turn_comes() -
     assert [number for number, *_ in results] == [2]
 
 
-@pytest.mark.parametrize("error", [InputError("one line"), StoreError("another"), ValueError("a", 1)])
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_an_error_reaches_the_caller_as_it_is_after_what_was_before_it(error: Exception, jobs: int) -> None:
+ERRORS = [InputError("one line"), StoreError("another"), ValueError("a", 1)]
+
+
+@pytest.mark.parametrize(("jobs", "error"), covering([1, 2], ERRORS))
+def test_an_error_reaches_the_caller_as_it_is_after_what_was_before_it(jobs: int, error: Exception) -> None:
     results = side_by_side(faulty, [1, error, 2], jobs)
     assert next(results) == 1
     with pytest.raises(type(error)) as caught:
@@ -118,9 +121,11 @@ def at_work(process: subprocess.Popen[bytes], marks: Path) -> bool:
     return len(list(marks.iterdir())) == 2
 
 
+SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGKILL]
+
+
 @pytest.mark.usefixtures("_listening")
-@pytest.mark.parametrize("ready", [starting, at_work])
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL], ids=lambda how: how.name)
+@pytest.mark.parametrize(("how", "ready"), covering(SIGNALS, [starting, at_work]))
 def test_nothing_is_left_of_a_command_that_is_stopped(
     how: signal.Signals, ready: Callable[[subprocess.Popen[bytes], Path], bool], tmp_path: Path
 ) -> None:
@@ -140,8 +145,8 @@ def test_nothing_is_left_of_a_command_that_is_stopped(
             os.killpg(process.pid, how)
         else:
             process.send_signal(how)
-        assert process.wait(30) == (130 if how == signal.SIGINT else -how)
-        end = time.monotonic() + 30
+        assert process.wait(LONG) == (130 if how == signal.SIGINT else -how)
+        end = time.monotonic() + LONG
         while (left := started_by(process.pid)) and time.monotonic() < end:
             time.sleep(0.02)
         assert left == []

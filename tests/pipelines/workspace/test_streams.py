@@ -1,4 +1,7 @@
-"""Text in and out: whatever the locale, whoever stops reading, and where the code's commit cannot be read."""
+"""Text in and out: whatever the locale, whoever stops reading, and where the code's commit cannot be read.
+
+A launch that nobody reads any more is in `tests/robustness/test_installed.py`.
+"""
 
 import json
 import os
@@ -92,38 +95,6 @@ def test_a_full_disk_is_one_line(study: Path) -> None:
         done = rhmc("study", "check", str(study), stdout=full)
     assert done.returncode == 1
     assert done.stderr == b"rhmc: standard output: No space left on device; what was printed is not all there\n"
-
-
-LAUNCH = """
-import os, sys
-from contextlib import nullcontext
-from pathlib import Path
-from pipelines.execution import ray_driver
-from pipelines.execution import run
-from pipelines.workspace import streams
-from tests.robustness.chaos import fit_here
-from tests.pipelines.support import CODE, tiny
-streams.settle()
-ray_driver.ray_session = lambda *args: nullcontext([])
-ray_driver.fit = fit_here
-sys.exit(run.run_studies([tiny()], Path(sys.argv[1])))
-"""
-
-
-def test_a_launch_goes_on_when_nobody_reads_any_more(home: Path) -> None:
-    told, ours = os.pipe()
-    os.close(told)
-    command = [sys.executable, "-W", "ignore", "-c", LAUNCH, str(home)]
-    done = subprocess.run(command, cwd=ROOT, stdout=ours, stderr=subprocess.PIPE, check=False)
-    os.close(ours)
-    assert done.returncode == 0, done.stderr
-    from pipelines.tracking.mlflow_tracker import open_existing
-    from pipelines.workspace.work_folder import Home
-    from tests.pipelines.support import tiny
-
-    tracker = open_existing(plan.study_card(tiny()), Home(home))
-    assert tracker is not None
-    assert [run.status for run in tracker.recorded()] == ["finished", "finished"]
 
 
 def test_the_entry_point_settles_first(monkeypatch: pytest.MonkeyPatch) -> None:

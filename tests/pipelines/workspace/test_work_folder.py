@@ -29,9 +29,8 @@ from pipelines.workspace import relocation, sqlite
 from pipelines.workspace.errors import InputError
 from pipelines.workspace.work_folder import Home, StoreError, work_folder
 from rhmc.training.trainer import Trainer, grid_step
-from tests.pipelines.support import fresh, setting, tiny
+from tests.pipelines.support import HOSTILE, fresh, setting, tiny
 
-HOSTILE = "#x ?y %2F z'\"~{a}\n"
 STUDY = tiny(arms={"one": setting(), "two": setting(lr=1e-2)})
 SEARCH = """\
 question: Which?
@@ -196,7 +195,7 @@ def test_runs_that_came_without_policies_travel_on_without_them(old: Path, tmp_p
     assert not (tmp_path / "c" / "policies").exists()
 
 
-# Any name
+# Any name; a launch in one is in `tests/robustness/test_installed.py`
 
 
 @given(st.text(st.characters(blacklist_characters="/\0", blacklist_categories=("Cs",)), min_size=1, max_size=60))
@@ -250,18 +249,6 @@ def test_a_folder_of_any_name_keeps_everything_inside(tmp_path: Path, monkeypatc
     assert sorted(file.name for file in tmp_path.iterdir()) == [new.name, "here"]
     assert not list((tmp_path / "here").iterdir())
     assert {"artifacts", "locks", "mlflow.db", "optuna.db"} <= {file.name for file in new.iterdir()}
-
-
-def test_a_launch_in_a_folder_of_any_name(tmp_path: Path) -> None:
-    home = tmp_path / HOSTILE.strip()
-    words = [sys.executable, "-W", "ignore", "-m", "tests.pipelines.support", str(home), "2", "1"]
-    root = Path(__file__).parents[3]
-    done = subprocess.run(words, cwd=root, capture_output=True, text=True, timeout=500, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert [file.name for file in tmp_path.iterdir()] == [home.name]
-    tracker = open_existing(study_card(tiny(points=2)), Home(home))
-    assert tracker is not None
-    assert {one.status for one in tracker.recorded()} == {"finished"}
 
 
 @pytest.mark.parametrize(

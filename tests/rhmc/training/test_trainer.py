@@ -20,6 +20,7 @@ from rhmc.envs import ENVS, Task
 from rhmc.learning.learner import Learner, Learners
 from rhmc.training.trainer import Config, Means, Trainer, grid_step
 from rhmc.types import Frozen, Metrics, Obs, Spec, Transition
+from tests.depth import covering
 
 ENVIRONMENTS = 4
 
@@ -201,15 +202,13 @@ def trained(kind: str) -> dict[str, Any]:
     return outcome_of(trainer(method(kind)))[1]
 
 
-@pytest.mark.parametrize("kind", METHODS)
-@pytest.mark.parametrize(
-    "changes",
-    [{"eval_episodes": 50}, {"evaluations": 1}, {"evaluations": 12}, {"final_episodes": 2}, {"eval_seed": 3}],
-    ids=str,
-)
-def test_evaluating_otherwise_does_not_change_training(kind: str, changes: dict[str, int]) -> None:
+OTHERWISE = [("eval_episodes", 50), ("evaluations", 1), ("evaluations", 12), ("final_episodes", 2), ("eval_seed", 3)]
+
+
+@pytest.mark.parametrize(("kind", "name", "value"), [(kind, *change) for kind, change in covering(METHODS, OTHERWISE)])
+def test_evaluating_otherwise_does_not_change_training(kind: str, name: str, value: int) -> None:
     usual = trained(kind)
-    _, other = outcome_of(trainer(method(kind), **changes))
+    _, other = outcome_of(trainer(method(kind), **{name: value}))
     assert assert_same(usual, other) > 50
 
 
