@@ -15,6 +15,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 DIGITS = 12
+IMPORTS = (ast.Import, ast.ImportFrom)
+NAMED = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
+HOW = {"ctx", "kind", "type_comment"}  # fields that only say how something was written
 
 
 def digest(text: str) -> str:
@@ -118,10 +121,12 @@ class Source:
     def __init__(self, name: str, path: Path) -> None:
         tree = ast.parse(path.read_bytes(), filename=str(path))
         base = name if path.stem == "__init__" else name.rpartition(".")[0]
-        self.bindings = [one for node in _walk(tree) for one in _bindings(node, base)]
-        self.syntax = "".join(_canonical(tree)) if any(_counts(node) for node in tree.body) else ""
-        self.used = {node.id for node in _walk(tree) if isinstance(node, ast.Name)} | {"*"}
-        self.used |= {str(node.value) for node in _walk(tree) if isinstance(node, ast.Constant)}  # quoted annotations
+        nodes: list[ast.AST] = []
+        _gather(tree, nodes)
+        self.bindings = [one for node in nodes if isinstance(node, IMPORTS) for one in _bindings(node, base)]
+        self.syntax = canonical(tree) if any(_counts(node) for node in tree.body) else ""
+        self.used = {node.id for node in nodes if isinstance(node, ast.Name)} | {"*"}
+        self.used |= {str(node.value) for node in nodes if isinstance(node, ast.Constant)}  # quoted annotations
         self.defined = set(_defined(tree.body))
 
     @cached_property
@@ -132,7 +137,9 @@ class Source:
 
 def _counts(node: ast.AST) -> bool:
     """True if a statement is more than a text, an import, a list of names to be offered, or for type checkers alone."""
-    if isinstance(node, ast.Import | ast.ImportFrom):
+    if not isinstance(node, ast.stmt):
+        return True
+    if isinstance(node, IMPORTS):
         return False
     if isinstance(node, ast.Expr):
         return not (isinstance(node.value, ast.Constant) and isinstance(node.value.value, str))
@@ -141,12 +148,12 @@ def _counts(node: ast.AST) -> bool:
     return not (isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"))
 
 
-def _walk(node: ast.AST) -> Iterator[ast.AST]:
-    """The node and all below it, imports included, other statements that do not count left out."""
-    yield node
+def _gather(node: ast.AST, found: list[ast.AST]) -> None:
+    """Append the node and all below it, imports included, other statements that do not count left out."""
+    found.append(node)
     for child in ast.iter_child_nodes(node):
-        if _counts(child) or isinstance(child, ast.Import | ast.ImportFrom):
-            yield from _walk(child)
+        if _counts(child) or isinstance(child, IMPORTS):
+            _gather(child, found)
 
 
 def _bindings(node: ast.AST, base: str) -> Iterator[Binding]:
@@ -164,7 +171,7 @@ def _bindings(node: ast.AST, base: str) -> Iterator[Binding]:
 def _defined(body: Iterable[ast.AST]) -> Iterator[str]:
     """Names that a module's own statements define, those inside functions and classes left out."""
     for node in body:
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+        if isinstance(node, NAMED):
             yield node.name
         elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
             yield node.id
@@ -172,23 +179,29 @@ def _defined(body: Iterable[ast.AST]) -> Iterator[str]:
             yield from _defined(ast.iter_child_nodes(node))
 
 
-def _canonical(node: ast.AST) -> Iterator[str]:
+def canonical(tree: ast.AST) -> str:
     """The syntax as ASCII text, the same under every Python: fields that are empty or only say how are left out."""
+    words: list[str] = []
+    _say(tree, words)
+    return "".join(words)
+
+
+def _say(node: ast.AST, words: list[str]) -> None:
     if isinstance(node, ast.Constant):
-        yield _constant(node.value)
+        words.append(_constant(node.value))
         return
-    yield f"({type(node).__name__}"
+    words.append(f"({type(node).__name__}")
     for field in sorted(node._fields):
         value = getattr(node, field, None)
-        if field in {"ctx", "kind", "type_comment"} or value is None or value == []:
+        if field in HOW or value is None or value == []:
             continue
-        yield f" {field}="
+        words.append(f" {field}=")
         for part in value if isinstance(value, list) else [value]:
             if not isinstance(part, ast.AST):
-                yield json.dumps(part)
+                words.append(json.dumps(part))
             elif _counts(part) and not _nothing(node, part):
-                yield from _canonical(part)
-    yield ")"
+                _say(part, words)
+    words.append(")")
 
 
 def _nothing(node: ast.AST, part: ast.AST) -> bool:
