@@ -476,6 +476,28 @@ def test_a_heavy_import_is_found_at_any_depth() -> None:
     assert "torch" in loaded("pipelines.cli.main", sources | {"pipelines": "import torch"})
 
 
+# Docstrings
+
+QUESTIONS = ("What", "Which", "Who", "Whose", "Whether", "How", "Where", "When", "Why")
+SAID = sorted(path for name in ("rhmc", "pipelines", "reports") for path in (ROOT / name).rglob("*.py"))
+
+
+def asking(source: str) -> list[str]:
+    """The docstrings that begin with a question word instead of their subject, by their first lines."""
+    kinds = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    texts = [ast.get_docstring(node) or "" for node in ast.walk(ast.parse(source)) if isinstance(node, kinds)]
+    return [text.partition("\n")[0] for text in texts if text.partition(" ")[0] in QUESTIONS]
+
+
+def test_a_docstring_begins_with_its_subject() -> None:
+    found = [f"{path.relative_to(ROOT)}: {line}" for path in SAID for line in asking(path.read_text(encoding="utf-8"))]
+    assert not found
+
+
+def test_a_docstring_that_asks_is_found() -> None:
+    assert asking('"""How far it is."""\ndef f():\n    """Whatever."""\n') == ["How far it is."]
+
+
 # Tables
 
 

@@ -189,7 +189,7 @@ def load_studies(
 
 
 def load_each(files: Sequence[Path], load: Callable[[Path], Loaded]) -> list[Loaded]:
-    """What is in each of the files.
+    """Contents of each of the files.
 
     Raises:
         InputError: with every fault of all of them.

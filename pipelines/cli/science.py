@@ -144,7 +144,7 @@ def _settings(config: "type[BaseModel]", tuned: Mapping[str, Mapping[str, object
 
 
 def _summary(config: "type[BaseModel]") -> str:
-    """What the page of a task says it is, in its first line."""
+    """First line of the page of a task."""
     return (inspect.getdoc(sys.modules[config.__module__]) or "").partition("\n")[0].rstrip(".")
 
 

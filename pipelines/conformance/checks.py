@@ -1,4 +1,4 @@
-"""What a check is, its outcome, and the parts that checks of methods and of tasks share."""
+"""A check, its outcome, and the parts that checks of methods and of tasks share."""
 
 import io
 from collections.abc import Callable, Iterable, Iterator, Mapping

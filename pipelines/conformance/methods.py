@@ -172,7 +172,7 @@ def values_stay_finite_at_cut_and_ended_episodes(case: Case) -> None:
 
 
 def every_learner_is_named(case: Case) -> None:
-    """What learns changes over a run, and nothing but what `learners()` names has an optimiser."""
+    """Learners change over a run, and nothing but what `learners()` names has an optimiser."""
     run = _trainer(case)
     before = deepcopy([one.state_dict() for one in run.algorithm.learners()])
     list(run)

@@ -141,7 +141,7 @@ def a_step_changes_no_state_in_place(env: Any) -> None:
 
 
 def copies_do_not_touch_each_other(env: Any) -> None:
-    """What the first copy does changes nothing in the others."""
+    """Actions in the first copy change nothing in the others."""
     one, other = _made(env), _made(env)
     action = at_random(one, seeded(4))
     changed = action.clone()

@@ -72,7 +72,7 @@ class Timer:
 
 
 def for_all(tally: Tally) -> str:
-    """How far the whole queue is, in a line."""
+    """Progress of the whole queue, in a line."""
     left = tally.left()
     return str(tally) if left is None else f"{tally}, about {duration(left)} left for all"
 
@@ -101,7 +101,7 @@ class Board(Protocol):
     ) -> None: ...
 
     def expect(self, tally: Tally) -> None:
-        """What is about to be trained, before the first of it begins. The board keeps the tally."""
+        """Announce the runs, before the first of it begins. The board keeps the tally."""
         ...
 
     def start(self, name: str, total: int, reached: int = 0, kind: str = "") -> None:

@@ -1,4 +1,4 @@
-"""How far a study is, for people and for scripts. Imports nothing heavy."""
+"""Progress of a study, for people and for scripts. Imports nothing heavy."""
 
 import json
 from collections import Counter

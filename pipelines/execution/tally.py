@@ -1,4 +1,4 @@
-"""How far a whole queue of runs or trials is, and about how long it will take; nothing is printed here."""
+"""Progress of a whole queue of runs or trials, and about how long it will take; nothing is printed here."""
 
 import time
 from collections import Counter, defaultdict

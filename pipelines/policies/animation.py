@@ -187,7 +187,7 @@ Paint = Callable[["Brush", Scene], None]
 
 
 class Painter(NamedTuple):
-    """How a task is drawn."""
+    """Drawing of a task."""
 
     paint: Paint
     half_width: Callable[[Panel], float]  # of what a panel shows
@@ -200,7 +200,7 @@ PAINTERS = {  # of this project's tasks
 
 
 def painter(kind: str) -> Painter:
-    """How a task is drawn, as this project or the task itself has it.
+    """Painter of a task, as this project or the task itself has it.
 
     Raises:
         InputError: neither has.

@@ -162,5 +162,5 @@ def _tried(policy: State, setting: "Setting") -> None:
 
 
 def addresses(found: Mapping[str, Policy]) -> dict[str, str]:
-    """Where each policy was found, by digest."""
+    """Address of each policy, by digest."""
     return {digest: policy.address for digest, policy in found.items()}

@@ -239,7 +239,7 @@ def _unregistered(parts: Mapping[str, Any]) -> bool:
 
 
 def unnamed(wanted: Iterable[str]) -> str:
-    """What to do about the first of these modules that nobody has named here; nothing where all are named."""
+    """Advice about the first of these modules that nobody has named here; nothing where all are named."""
     strangers = [module for module in wanted if not names(module)]
     if not strangers:
         return ""

@@ -344,7 +344,7 @@ class Planned(NamedTuple):
 
 
 class Beside(NamedTuple):
-    """What a study takes from elsewhere."""
+    """Parts that a study takes from elsewhere."""
 
     preset: Preset
     starts: Starts

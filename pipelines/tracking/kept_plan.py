@@ -39,7 +39,7 @@ STATUS = {"RUNNING": "running", "FINISHED": "finished", "FAILED": "failed", "KIL
 
 
 class Options(NamedTuple):
-    """What a command line says of a study."""
+    """Options of a command line that decide a study's plan."""
 
     file: str
     profile: str

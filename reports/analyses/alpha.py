@@ -255,7 +255,7 @@ def mechanism(results: Results, study: str) -> dict[float, Effect]:
 
 
 def _points(results: Results, study: str, arm: str, quantity: str = QUANTITIES[0][0]) -> pd.DataFrame:
-    """What an arm logged of a quantity while it trained."""
+    """Curve that an arm logged of a quantity while it trained."""
     rows = results.curve(study, arm, f"train/{quantity}")
     return rows[np.isfinite(rows["value"].astype(float))]
 

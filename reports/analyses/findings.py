@@ -1,4 +1,4 @@
-"""What a figure shows, in one sentence that is computed from its numbers: who is ahead, by how much, how surely."""
+"""Finding of a figure, in one sentence that is computed from its numbers: who is ahead, by how much, how surely."""
 
 from collections.abc import Mapping, Sequence
 
@@ -65,7 +65,7 @@ def of_spread(results: Results, study: str) -> str:
 
 
 def of_profile(results: Results, study: str) -> str:
-    """How many arms lie wholly below the worst seed of the best one."""
+    """Count the arms that lie wholly below the worst seed of the best one."""
     arms = compared(results, study)
     best, worst = arms[0], float(results.finals(study, arms[0]).min())
     below = [arm for arm in arms[1:] if float(results.finals(study, arm).max()) < worst]
@@ -110,7 +110,7 @@ def _span(gaps: Sequence[float]) -> str:
 
 
 def of_effects(results: Results, study: str) -> str:
-    """How many effects of each part have an interval, or a range, that leaves zero."""
+    """Count the effects of each part that have an interval, or a range, that leaves zero."""
     said = []
     for part in dict.fromkeys(one.part for one in alpha.effects(results, study)):
         values = [alpha.measured(results, study, one) for one in alpha.effects(results, study) if one.part == part]

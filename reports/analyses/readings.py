@@ -64,7 +64,7 @@ class Contrast:
 
     @cached_property
     def fit(self) -> "Fit":
-        """What `fitted` finds."""
+        """Result of `fitted`."""
         return fitted(self)
 
 

@@ -1,4 +1,4 @@
-"""What the budget of a search bought: the best objective against the number of trials, and the winner of each arm.
+"""Gain of a search's budget: the best objective against the number of trials, and the winner of each arm.
 
 The objective is the final return, averaged over the seeds of a trial. Every trial of the budget counts as one, pruned
 and failed ones as well; the best is that of complete trials alone, the earliest among equals.
@@ -80,7 +80,7 @@ def _config(text: str) -> dict[str, Any]:
 
 
 def question(results: Results, search: str) -> str:
-    """What a search asks."""
+    """Question of a search."""
     return str(results.trials.loc[results.trials["search"] == search, "question"].iloc[0])
 
 

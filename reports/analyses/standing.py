@@ -1,4 +1,4 @@
-"""Where the arms of a study stand against the best one: clearly below, level, or not to be told with these seeds.
+"""Standing of the arms of a study against the best one: clearly below, level, or not to be told with these seeds.
 
 Clear is Welch's test below 0.05 after Holm's correction over all pairs of the study, as in the table of pairs. Level is
 equivalence within `MARGIN`, corrected over the arms that are not clear. What is neither had too few seeds: about how
@@ -99,7 +99,7 @@ def needed(x: Values, y: Values, alpha: float) -> int | None:
 
 
 def sentence(results: Results, study: str) -> str:
-    """Where the arms stand, in a sentence a task; the first sentence of a study's report."""
+    """Standing of the arms, in a sentence a task; the first sentence of a study's report."""
     found = standings(results, study)
     if not found:
         return _alone(results, study)

@@ -1,4 +1,4 @@
-"""What the rule of a claim may look at, the comparisons that it makes, and the words that it answers with."""
+"""Evidence that the rule of a claim may look at, the comparisons that it makes, and the words that it answers with."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field

@@ -346,7 +346,7 @@ def _all(parts: Mapping[str, bool], what: str, ours: Mapping[str, Interval]) -> 
 
 
 def _best(see: Evidence, study: str) -> Finding:
-    """Whether RHMC is above every other method of a study."""
+    """Judge whether RHMC is above every other method of a study."""
     ours, (others, absent) = see.finals(study, "RHMC"), see.rivals(study)
     found = compare({f"RHMC − {arm}": (ours, see.finals(study, arm)) for arm in others})
     failed = [arm for arm, one in zip(others, found.values(), strict=True) if not one.above]
@@ -366,7 +366,7 @@ def _below(see: Evidence, study: str, arm: str, other: str) -> Finding:
 
 
 def _near(see: Evidence, arm: str, level: float) -> Finding:
-    """Whether an arm of study `coverage` ends near a level; the policies that do so without learning are named."""
+    """Judge whether an arm of study `coverage` ends near a level; names policies that do so without learning."""
     values = see.finals("coverage", arm)
     holds, ours = near(values, level, NEAR), interval(values)
     rules = {name: x for name, x in see.scripted("coverage").items() if abs(x - level) < NEAR}
@@ -409,7 +409,7 @@ def _steady_without_learning(see: Evidence, counts: Sequence[int]) -> str:
 
 
 def _order(see: Evidence, arm: str) -> Finding:
-    """Whether the whole method is above an arm without a part: over the readings, or in the one of the ablation."""
+    """Judge whether the whole method is above an arm without a part: over the readings, or in the ablation's."""
     name, theirs = f"full − {arm}", _table_2_gap(see, arm)
     if found := see.readings(arm):
         verdicts: Mapping[str, Verdict] = {"holds": "reproduced", "depends on the reading": "depends on the reading"}
@@ -447,7 +447,7 @@ def _over_readings(found: Contrast) -> dict[str, Interval]:
 
 
 def _size(see: Evidence, claim: str, arm: str) -> Finding:
-    """Whether the loss without a part is of the paper's size: over the readings, or in the one of the ablation."""
+    """Judge whether the loss without a part is of the paper's size: over the readings, or in the ablation's."""
     said = see.stated(claim)
     theirs = 100 * (said["without"] / said["full"] - 1)
     paper = f"the paper's numbers give {percent(theirs)} (stated: −{said['stated']:g} %)"

@@ -59,7 +59,7 @@ class Method(Part):
 
 
 class Said(Part):
-    """What a task of another package says of itself."""
+    """Words of a task of another package about itself."""
 
     unit: Annotated[str, Field(max_length=80)]  # of its return, in words
 

@@ -308,7 +308,7 @@ class Results:
 
     @cached_property
     def memo(self) -> dict[str, Any]:
-        """What several parts of a report work out of these tables once, by name."""
+        """Results that several parts of a report work out of these tables once, by name."""
         return {}
 
     @cached_property

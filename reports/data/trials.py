@@ -56,7 +56,7 @@ def _row_faults(row: Any, profile: str) -> Iterator[str]:
 
 
 def params(text: str) -> Any:
-    """What was tried, by dotted name of a setting; None if it is no JSON."""
+    """Values that were tried, by dotted name of a setting; None if it is no JSON."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError):

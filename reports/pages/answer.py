@@ -29,7 +29,7 @@ class Answer(NamedTuple):
 
 
 def sentence(claims: Sequence[Claim]) -> str:
-    """Whether the paper holds: the number of claims with each verdict, and how many of these are provisional."""
+    """Answer in one sentence: the number of claims with each verdict, and how many of these are provisional."""
     counts, total = Counter(str(claim.verdict) for claim in claims), len(claims)
     rest = [f"{counts[verdict]} {said[counts[verdict] > 1]}" for verdict, said in SAID.items() if counts[verdict]]
     provisional = sum(claim.provisional for claim in claims)
@@ -44,7 +44,7 @@ def sentence(claims: Sequence[Claim]) -> str:
 
 
 def questions(report: Report) -> list[Answer]:
-    """What a reader asks next."""
+    """Questions that a reader asks next."""
     every = {
         "Which method is best?": [Markup.escape(line) for line in report.short]
         or [Markup("No runs to tell from yet.")],
@@ -56,7 +56,7 @@ def questions(report: Report) -> list[Answer]:
 
 
 def _regulator(claims: Sequence[Claim]) -> Iterator[Markup]:
-    """What regulation is, and what it was worth."""
+    """Words on regulation, and its worth here."""
     yield Markup(
         "Where agents earn less than Algorithm 1 says that they could have, it pays the coordinator that reward: "
         "executors that still miss then spoil no assignment."

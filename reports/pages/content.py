@@ -47,7 +47,7 @@ def of(report: Report) -> Mapping[str, Any]:
 
 
 def _head(report: Report) -> dict[str, Any]:
-    """What stands above all parts: the answer of a report on the paper, the question of one on a study."""
+    """Head of the page: the answer of a report on the paper, the question of one on a study."""
     asked = report.paper is None
     return {
         "title": report.title,
@@ -137,7 +137,7 @@ def _section(report: Report, name: str, title: str, study: str, names: Sequence[
 
 
 def _links(report: Report) -> page.Links:
-    """Where the page shows each arm."""
+    """Place on the page of each arm."""
     charts = [(p.study, p.chart.places) for p in report.pictures if p.chart]
     return page.Links(
         {(study, arm): place for study, places in charts for arm, place in places.items()},

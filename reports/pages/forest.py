@@ -92,7 +92,7 @@ def _span(found: Headline, low: float, high: float) -> Span:
 
 
 def _stated(found: Headline) -> str:
-    """What the paper says: its number, or the side on which it has ours."""
+    """Value of the paper: its number, or the side on which it has ours."""
     if not math.isnan(found.paper):
         return show(found.paper, found.unit) + (" %" if found.unit == PERCENT else "")
     end, sign = (found.low, ">") if math.isinf(found.high) else (found.high, "<")

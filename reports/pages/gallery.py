@@ -177,7 +177,7 @@ def _specification(results: Results, study: str, found: readings.Contrast) -> Ma
 
 
 def _by_alpha(results: Results, study: str) -> Iterator[Picture]:
-    """What regulation and the filter are worth at each alpha, and the rewards behind that."""
+    """Worth of regulation and the filter at each alpha, and the rewards behind that."""
     title = f"Effect of regulation and of the filter by alpha, study {study}"
     yield from picture(f"effects_{stem(study)}", title, partial(_effects, results, study), study)
     title = f"The mechanism, seen, study {study}"

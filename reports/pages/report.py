@@ -141,7 +141,7 @@ def definitions(results: Results) -> list[tuple[str, str]]:
 
 
 def question(results: Results, study: str) -> str:
-    """What a study or a search asks."""
+    """Question of a study or a search."""
     if study in results.searches:
         return searches.question(results, study)
     return str(results.plan(study)["question"].iloc[0])

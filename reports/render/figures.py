@@ -324,7 +324,7 @@ UNITS = {"coverage": "100 × mean reward per step", "navigation": "sum over an e
 
 
 def per(results: Results, task: str) -> str:
-    """What a return of a task is, in words; of one that is not this project's, what it says of itself."""
+    """Meaning of a return of a task, in words; of one that is not this project's, what it says of itself."""
     return UNITS.get(task) or results.units.get(task, "as the task defines it")
 
 

@@ -139,7 +139,7 @@ def finals(results: Results, study: str) -> Table:
 
 
 def _luck(results: Results, study: str) -> str:
-    """What the evaluation episodes add to a final return, in words; none where no run says it."""
+    """Spread that the evaluation episodes add to a final return, in words; none where no run says it."""
     errors = np.concatenate(
         [results.finals(study, arm, EPISODE_ERROR) for arm in results.arms(study)] or [np.array([])]
     )

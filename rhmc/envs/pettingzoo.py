@@ -98,7 +98,7 @@ class ParallelTask(ParallelEnv[Agent, Array, Any]):
         return self._seen.flatten().numpy().copy()
 
     def observed(self) -> Obs:
-        """What the agents see now, as methods of this project take it: a batch of one."""
+        """Observation of the agents now, as methods of this project take it: a batch of one."""
         return unflattened(self.cfg, self._seen.unsqueeze(0), first=self._first)
 
     def split(self, action: Tensor) -> dict[Agent, Any]:
@@ -169,7 +169,7 @@ def unflattened(cfg: EnvConfig, vectors: Tensor, *, first: bool) -> Obs:
 
 
 def _others(n: int) -> Tensor:
-    """Which pairs of agents are two: (N, N) bool."""
+    """Mask of the pairs of two different agents: (N, N) bool."""
     return ~torch.eye(n, dtype=torch.bool)
 
 

@@ -1,4 +1,4 @@
-"""What a task offers beside its physics: its headlines, its policies without learning, and how it is drawn.
+"""Offers of a task beside its physics: its headlines, its policies without learning, and how it is drawn.
 
 None of it decides a run. What a task leaves out is left out where it would be shown.
 """
@@ -29,5 +29,5 @@ OFFERS: dict[str, Offers] = {  # by kind; the policies of these two are in the t
 
 
 def offered(kind: str) -> Offers:
-    """What a task offers; of one that says nothing, its return."""
+    """Offers of a task; of one that says nothing, its return."""
     return OFFERS.get(kind, Offers())
