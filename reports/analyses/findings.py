@@ -40,7 +40,8 @@ def _ahead(results: Results, study: str, found: Sequence[Pair]) -> str:
     clear = sum(pair.corrected < CLEAR for pair in others)
     overlap = results.finals(study, best).min() <= results.finals(study, second).max()
     seeds = "whose seeds overlap with its own" if overlap else "whose seeds all end lower"
-    gap = f"{number(found[0].difference.value)} above {second}, {seeds}"
+    gap = number(found[0].difference.value)
+    gap = f"level with {second}, {seeds}" if gap == number(0) else f"{gap} above {second}, {seeds}"
     count = "none" if not clear else "all" if clear == len(others) else f"{clear}"
     sure = (
         f"the gap is clear to {count} of the other {len(others)} arms"

@@ -116,7 +116,8 @@ def single(results: Results, paper: Paper, study: str) -> Report:
         pictures = list(search_gallery(results, study))
         return Report(results, f"Search {study}, {noted}", lead, pictures, made, gaps, open=len(gaps))
     lead, made = f"{asked} {_lead(results)}", sheets.of_study(results, study) | sheets.last(own)
-    pictures, smoke = study_gallery(results, paper, study), rules.smoke_test(own, paper)
+    pictures = study_gallery(results, paper, study)
+    smoke = rules.smoke_test(own, paper) if _mine(results, paper) else ""  # the paper has no budget for other studies
     about: dict[str, Any] = {"smoke": smoke, "open": len(gaps)}
     if not results.has_readings(study):
         about["answer"] = standing.sentence(results, study)

@@ -41,6 +41,12 @@ def test_overlapping_data(tmp_path: Path) -> None:
     assert findings.of_spread(found, "reach") == spread
 
 
+def test_arms_that_end_alike(tmp_path: Path) -> None:
+    two = results(tmp_path, {"A": [100.0, 100.0], "B": [100.0, 99.99]})
+    said = "A ends highest, at 100.0, level with B, whose seeds overlap with its own; the gap is not clear."
+    assert findings.of_curves(two, "reach") == said
+
+
 def test_two_arms_and_one(tmp_path: Path) -> None:
     two = results(tmp_path / "two", {"A": noisy(70, 5, 0.2), "B": noisy(65, 5, 0.2)})
     assert findings.of_curves(two, "reach").endswith("whose seeds all end lower; the gap is clear.")

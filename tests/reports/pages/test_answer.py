@@ -7,9 +7,11 @@ import pandas as pd
 import pytest
 
 from reports.claims.verdicts import VERDICTS, Claim
-from reports.data.paper import Source
+from reports.data.frame import load
+from reports.data.paper import Source, read
 from reports.pages.answer import SAID, sentence
 from reports.pages.build import build
+from reports.pages.report import single
 from tests.reports.factory import half_done, noisy, study, write, yardsticks
 
 NONE, HELD, FAILED, SHORT = "untestable", "reproduced", "not reproduced", "too short to judge"
@@ -75,6 +77,12 @@ def test_a_study_of_ones_own_changes_nothing_of_the_answer(tmp_path: Path) -> No
 def test_a_report_of_ones_own_study_alone_still_warns_of_short_runs(tmp_path: Path) -> None:
     build(write(tmp_path / "runs", study("mine", {"one": noisy(9)}, points=4, steps=1_000)), tmp_path / "a", "quick")
     assert "Smoke test. Every run here has" in header(tmp_path / "a")
+
+
+@pytest.mark.parametrize(("name", "warned"), [("coverage", True), ("mine", False)])
+def test_a_study_alone_is_short_where_the_paper_has_it(name: str, warned: bool, tmp_path: Path) -> None:
+    found = load(write(tmp_path, study(name, {"RHMC": noisy(67)}, points=4, steps=1_000)), "quick")
+    assert bool(single(found, read(), name).smoke) is warned
 
 
 @pytest.mark.parametrize(
