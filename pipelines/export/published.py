@@ -79,11 +79,12 @@ def export_log(studies: Sequence[str], profile: str, home: Path, out: Path) -> N
         StudyError: one of them has no file, or a faulty one.
         StoreError: the log cannot be read.
     """
+    from pipelines.tracking.initial import finder
     from pipelines.tracking.mlflow_tracker import open_existing
 
     for name in studies:
         stem, _, variant = name.partition("@")
-        study = Study.load(Path("studies") / f"{stem}.yaml", profile, variant=variant or None)
+        study = Study.load(Path("studies") / f"{stem}.yaml", profile, variant=variant or None, find=finder(home))
         write_tables(study, items(study), open_existing(study_card(study), Home(home)), out)
 
 

@@ -12,9 +12,11 @@ to the studies of this package. It may leave out `.yaml`. An included file may i
 `settings/<task>` and `settings/<task>/<method>` have. Under `preset: paper` lie the paper's networks and observation.
 """
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
+
+from pydantic.fields import FieldInfo
 
 from pipelines.specs.document import STUDIES, Fault, Node, Place, choices, join, merge, nearest, plain, read, show
 from pipelines.workspace.errors import InputError
@@ -83,6 +85,12 @@ def _kinds(node: Node | None, section: str) -> Iterator[str]:
 
 def _tuned(task: str, method: str = "") -> str:
     return f"settings/{task}/{method}" if method else f"settings/{task}"
+
+
+def _takes(field: FieldInfo, value: str) -> bool:
+    """True if a value is one of those that a field lists, or it lists none."""
+    listed = get_args(field.annotation)
+    return not listed or value in listed
 
 
 class _Way(NamedTuple):
@@ -202,7 +210,7 @@ class Preset:
         self._read: dict[tuple[str, str], tuple[Node | None, list[Fault]]] = {}  # by name and section
 
     def under(
-        self, stated: Node, section: str, task: str, method: str, fields: Collection[str]
+        self, stated: Node, section: str, task: str, method: str, fields: Mapping[str, FieldInfo]
     ) -> tuple[Node, list[Fault]]:
         """A section over what the preset has for it.
 
@@ -211,12 +219,13 @@ class Preset:
             section: env, algo or trainer.
             task: the kind of the task.
             method: the kind of the method.
-            fields: of the section's configuration; a package's own method may have no encoder.
+            fields: of the section's configuration; a package's own may lack one, or have other values for it.
         """
         if self.node is None:
             return stated, []
         values = PRESETS[str(self.node.value)].get(section, {})
-        layer: Node | None = _written({key: value for key, value in values.items() if key in fields}, self.node)
+        taken = {key: value for key, value in values.items() if key in fields and _takes(fields[key], value)}
+        layer: Node | None = _written(taken, self.node)
         faults: list[Fault] = []
         if self.node.value == TUNED:
             name = _tuned(task, method if section == "algo" else "")
@@ -247,7 +256,7 @@ def tuned(section: str, task: str, method: str = "") -> dict[str, Any]:
     """The tuned settings of a method in a task, or of the task itself, as a study here would get them."""
     place = Place("")
     stated, _ = Preset(Node(TUNED, place, place, ""), PROJECT).under(
-        Node({}, place, place, ""), section, task, method, ()
+        Node({}, place, place, ""), section, task, method, {}
     )
     values: dict[str, Any] = plain(stated)
     return values

@@ -115,9 +115,11 @@ def misfit(policy: Policy, setting: "Setting") -> str:
         _tried(policy.state, setting)
     except (ValueError, RuntimeError) as error:
         theirs, ours = _sizes(policy.setting), _sizes(setting)
-        if (theirs.agents, theirs.targets) != (ours.agents, ours.targets):
+        fixed = not str(setting.algo.encoder).startswith("pairwise") or not setting.algo.share
+        if fixed and (theirs.agents, theirs.targets) != (ours.agents, ours.targets):
             counts = f"{_counts(theirs)} there and {_counts(ours)} here"
-            return f"the policy does not fit: {counts}; only 'encoder: pairwise' with 'share: true' takes other numbers"
+            allowed = "only 'encoder: pairwise' or 'pairwise_gru', with 'share: true', takes other numbers"
+            return f"the policy does not fit: {counts}; {allowed}"
         others = ", ".join(_differing(policy.setting, setting)) or "none"
         return f"the policy does not fit: {error}; settings that differ: {others}"
     return ""

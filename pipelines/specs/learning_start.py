@@ -75,6 +75,8 @@ def _rhmc(algo: rhmc.Config, copies: int, episode: int) -> list[Start]:
     """Executors learn once a period has ended; the coordinator with some of their updates."""
     ended = copies * min(algo.assignment_period, episode)
     low, high = _warm(algo, copies), _warm(algo, copies, algo.coordinator.update_every)
+    if algo.coordinator.method != "learned":
+        high = low  # nothing says that another one learns
     period = f", and assignment_period {algo.assignment_period:,}" if ended > (low.step or 0) else ""
     return [Start(max(one.step or 0, ended), one.waits + period) for one in dict.fromkeys((low, high))]
 

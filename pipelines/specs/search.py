@@ -32,7 +32,7 @@ from pipelines.specs.grid import nested
 from pipelines.specs.identity import code_id
 from pipelines.specs.include import closure
 from pipelines.specs.initial import Find, addresses, nowhere
-from pipelines.specs.plugins import configs
+from pipelines.specs.plugins import COORDINATOR, configs, pages
 from pipelines.specs.safe_names import study_name
 from pipelines.specs.study import (
     TWIN,
@@ -228,9 +228,12 @@ class Search(Frozen):
         return list(range(FIRST_SEED, FIRST_SEED + self.seeds))
 
     def code(self, arm: str) -> str:
-        """The code that decides the trials of an arm."""
-        setting = self.arms[arm].setting
-        return code_id(setting.algo.kind, setting.env.kind, setting.imports)
+        """The code that decides the trials of an arm, with that of every coordinator that its space may choose."""
+        one = self.arms[arm]
+        methods = one.space.get(f"{COORDINATOR}.method")
+        chosen = {page for name in (methods.choices or () if methods else ()) for page in pages({COORDINATOR: name})}
+        setting = one.setting
+        return code_id(setting.algo.kind, setting.env.kind, tuple(sorted({*setting.imports, *chosen})))
 
     def identity(self, arm: str) -> str:
         """12 hex digits over all that decides what the trials of an arm are and give, but for how many there are.

@@ -662,9 +662,9 @@ def _misfit(setting: Setting, layers: Sequence[Node]) -> list[Fault]:
     if not text:
         return []
     field, _, fault = text.partition(": ")
-    env = _section(layers, "env")
-    node = _child(env, field) or env
-    return [Fault(node.place, node.path, fault)] if node else []
+    env, named = _section(layers, "env"), field in type(setting.env).model_fields
+    node = (_child(env, field) if named else None) or env
+    return [Fault(node.place, node.path, fault if named else text)] if node else []
 
 
 def _no_start(setting: Setting, layers: Sequence[Node], starts: Starts) -> list[Fault]:

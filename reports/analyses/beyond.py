@@ -310,6 +310,8 @@ def table_encoder(results: Results) -> Table | None:
         for a, b in combinations(configs, 2):
             if _but_encoder(configs[a]) != _but_encoder(configs[b]) or configs[a] == configs[b]:
                 continue
+            if {configs[arm]["algo"].get("encoder") for arm in (a, b)} != {"mlp", "pairwise"}:
+                continue  # encoders with memory are another question
             flat, pairwise = sorted((a, b), key=lambda arm: str(configs[arm]["algo"].get("encoder")))
             x, y = results.finals(study, pairwise), results.finals(study, flat)
             gap = difference(x, y) if len(x) and len(y) else None

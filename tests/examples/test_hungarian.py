@@ -10,6 +10,8 @@ from torch import Tensor
 
 from pipelines.conformance.checks import seeded
 from pipelines.specs.identity import code_id, modules, present
+from pipelines.specs.learning_start import starts
+from pipelines.specs.search import Search
 from pipelines.specs.study import RunSpec, Study, StudyError
 from pipelines.tracking.plan import items
 from pipelines.workspace.errors import InputError
@@ -150,3 +152,37 @@ def test_a_name_is_given_once() -> None:
     Study.load(FILE)
     with pytest.raises(ValueError, match="'learned' is registered already"):
         register_coordinator("learned", COORDINATORS["hungarian"])
+
+
+def test_a_search_that_may_choose_it_has_its_package_in_the_code_of_its_trials(tmp_path: Path) -> None:
+    Study.load(FILE)
+    file = tmp_path / "search_x.yaml"
+    text = (
+        "base: {env: {kind: coverage}, algo: {kind: rhmc}}\n"
+        "arms: {R: {space: {coordinator.method: {choices: [learned, hungarian]}}}}\n"
+        "trials: 2\nseeds: 1\nsteps: 100_000\nquestion: Which?\n"
+    )
+    file.write_text(text)
+    with_it = Search.load(file, "quick", []).code("R")
+    file.write_text(text.replace("coordinator.method: {choices: [learned, hungarian]}", "horizon: {choices: [1, 2]}"))
+    without = Search.load(file, "quick", []).code("R")
+    assert with_it == code_id("rhmc", "coverage", ("hungarian.coordinator",)) != without == code_id("rhmc", "coverage")
+
+
+def test_no_learning_is_waited_for_where_the_coordinator_does_not_learn() -> None:
+    Study.load(FILE)
+    algo = {"kind": "rhmc", "coordinator": {"method": "hungarian", "update_every": 20_000}}
+    assert len(starts(RunSpec.model_validate(PLAIN | {"algo": algo}))) == 1
+
+
+def test_a_reason_that_names_no_field_is_shown_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = "needs as many agents as targets: 3 and 3"
+    monkeypatch.setitem(COORDINATORS, "even", COORDINATORS["learned"]._replace(misfit=lambda spec: text))
+    file = tmp_path / "x.yaml"
+    file.write_text(
+        "question: Why?\nbase: {env: {kind: coverage}, algo: {kind: rhmc, coordinator: {method: even}}}\n"
+        "arms: {a: {}, b: {algo: {alpha: 0.2}}}\nseeds: 1\nsteps: 1_000_000\n"
+    )
+    with pytest.raises(StudyError) as caught:
+        Study.load(file)
+    assert {str(fault).partition("base.env: ")[2] for fault in caught.value.faults} == {text}

@@ -120,3 +120,8 @@ def test_its_study_has_no_fault_and_every_arm_trains() -> None:
     assert {spec.imports for spec in specs} == {("warehouse.task",)}
     for spec in specs:
         assert "final/return" in list(Trainer(spec.env, spec.algo, spec.trainer, 0))[-1]
+
+
+def test_the_paper_s_preset_leaves_what_the_task_does_not_have() -> None:
+    study = Study.load("studies/warehouse.yaml", "quick", ["preset=paper"])
+    assert {arm.env.observation for arm in study.arms.values()} == {"shared"}
