@@ -205,7 +205,8 @@ def test_a_copy_that_changed_and_a_policy_that_changed_meanwhile_are_refused(
         ),
         (
             {"algo": {"share": False}, "env": {"agents": 3}},
-            "2 agents and 2 targets there and 3 agents and 3 targets here; only 'encoder: pairwise' or 'pairwise_gru', with 'share: true'",
+            "2 agents and 2 targets there and 3 agents and 3 targets here; only 'encoder: pairwise' or 'pairwise_gru', "
+            "with 'share: true'",
         ),
     ],
 )
