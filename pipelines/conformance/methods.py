@@ -29,7 +29,7 @@ from pipelines.specs import limits
 from rhmc.algorithms import ALGORITHMS
 from rhmc.envs import ENVS, Task, coverage, make_env, navigation
 from rhmc.training.evaluation import evaluate
-from rhmc.training.trainer import Config, Trainer, misfit
+from rhmc.training.trainer import Config, Trainer
 from rhmc.types import Obs
 
 SMALL_TASKS = (coverage.Config(agents=2, targets=3), navigation.Config(agents=2, episode=7))
@@ -74,7 +74,7 @@ def check_method(kind: str, changes: dict[str, Any], steps: int, coordinator: st
     small = config.model_validate(nested(fitted(config, SMALL) | chosen))
     subject = f"{kind} with {coordinator}" if coordinator else kind
     for env in SMALL_TASKS:
-        if fault := misfit(env, small) or limits.misfit(env, small):
+        if fault := limits.misfit(env, small):
             yield Outcome(subject, f"acts in {env.kind}", left_out=fault)
             continue
         yield from outcomes(f"{subject} in {env.kind}", Case(small, env), CHECKS)

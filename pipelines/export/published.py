@@ -82,9 +82,10 @@ def export_log(studies: Sequence[str], profile: str, home: Path, out: Path) -> N
     from pipelines.tracking.initial import finder
     from pipelines.tracking.mlflow_tracker import open_existing
 
+    find = finder(home)
     for name in studies:
         stem, _, variant = name.partition("@")
-        study = Study.load(Path("studies") / f"{stem}.yaml", profile, variant=variant or None, find=finder(home))
+        study = Study.load(Path("studies") / f"{stem}.yaml", profile, variant=variant or None, find=find)
         write_tables(study, items(study), open_existing(study_card(study), Home(home)), out)
 
 

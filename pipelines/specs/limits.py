@@ -64,11 +64,14 @@ def beyond(name: str, value: Any) -> str:
 
 
 def misfit(env: Any, algo: Any) -> str:
-    """The reason why a method cannot learn in a task, as `field: text` with a field of the task, or nothing."""
+    """The reason why a method cannot act or learn in a task, as `field: text` with a field of the task, or nothing."""
     from rhmc.envs import ENVS  # brings torch along, which a fault in a file can do without
     from rhmc.hierarchy.coordinator import COORDINATORS
     from rhmc.hierarchy.regulation import MOST_TARGETS
+    from rhmc.training import trainer
 
+    if text := trainer.misfit(env, algo):
+        return text
     field = "targets" if "targets" in type(env).model_fields else "agents"  # navigation has as many of both
     count = getattr(env, field)
     if getattr(algo, "regulator", "") == "exact" and count > MOST_TARGETS:

@@ -182,9 +182,8 @@ class Study(Frozen):
     variant: str = ""
     readings: Plan | None = None
     cells: dict[str, Cell] = Field(default_factory=dict)  # by arm, where the study has readings
-    remarks: tuple[
-        str, ...
-    ] = ()  # arms whose budget ends before they learn; what the policies are that runs start from
+    # Arms whose budget ends before they learn; what the policies are that runs start from.
+    remarks: tuple[str, ...] = ()
     policies: dict[str, str] = Field(default_factory=dict)  # by digest, where those were found that runs start from
 
     @classmethod
@@ -658,7 +657,7 @@ def _over_preset(
 
 def _misfit(setting: Setting, layers: Sequence[Node]) -> list[Fault]:
     """A method that cannot act in its task, at the place of the task's field that it cannot do with."""
-    text = trainer.misfit(setting.env, setting.algo) or limits.misfit(setting.env, setting.algo)
+    text = limits.misfit(setting.env, setting.algo)
     if not text:
         return []
     field, _, fault = text.partition(": ")

@@ -9,6 +9,13 @@ from pipelines.specs import identity
 from tests.pipelines.own_package import untouched
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
+SHORT = [  # a study of an example that is trained to its end in a moment
+    "steps=80",
+    "trainer.num_envs=4",
+    "trainer.evaluations=1",
+    "trainer.eval_episodes=2",
+    "trainer.final_episodes=2",
+]
 
 
 @pytest.fixture(autouse=True)

@@ -18,17 +18,11 @@ from pipelines.workspace.errors import InputError
 from rhmc.envs import coverage, make_env, navigation
 from rhmc.hierarchy.coordinator import COORDINATORS, Coordination, register_coordinator
 from rhmc.training.trainer import Trainer
+from tests.examples.conftest import SHORT
 from tests.pipelines.support import run_rhmc
 
 EXAMPLE = "hungarian"
 FILE = "studies/hungarian.yaml"
-SHORT = [
-    "steps=80",
-    "trainer.num_envs=4",
-    "trainer.evaluations=1",
-    "trainer.eval_episodes=2",
-    "trainer.final_episodes=2",
-]
 PLAIN = {"env": {"kind": "coverage"}, "algo": {"kind": "rhmc"}, "trainer": {}, "seed": 0}
 OWN = PLAIN | {"algo": {"kind": "rhmc", "coordinator": {"method": "hungarian"}}}
 

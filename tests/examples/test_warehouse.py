@@ -16,18 +16,11 @@ from rhmc.algorithms import ALGORITHMS
 from rhmc.hierarchy.regulation import Charges, exact
 from rhmc.training.trainer import Trainer
 from rhmc.yardsticks.scores import play_yardsticks
-from tests.examples.conftest import EXAMPLES
+from tests.examples.conftest import EXAMPLES, SHORT
 from tests.oracles import warehouse as oracle
 from tests.pipelines.support import run_rhmc
 
 EXAMPLE = "warehouse"
-SHORT = [
-    "steps=80",
-    "trainer.num_envs=4",
-    "trainer.evaluations=1",
-    "trainer.eval_episodes=2",
-    "trainer.final_episodes=2",
-]
 SIZES = [(3, 4, 5), (1, 1, 2), (4, 2, 3)]  # robots, orders, cells along a side: walls, ties and orders on one cell
 
 
